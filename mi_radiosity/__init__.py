@@ -1,0 +1,12 @@
+"""Hierarchical Monte Carlo radiosity for Mitsuba 3, refined by generalised mutual information."""
+from ._llvm import choose_llvm as _choose_llvm
+
+_choose_llvm()      # before anything imports drjit
+
+from .errors import RadiosityError                                                              # noqa: E402
+from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap  # noqa: E402
+from .solver import Solution, solve                                                             # noqa: E402
+
+__version__ = "0.1.0"
+__all__ = ["solve", "Solution", "Oracle", "Pair", "KernelSamples", "GMI", "KS", "MI", "Power", "Uniform",
+           "information_gap", "RadiosityError"]

@@ -1,0 +1,76 @@
+"""Small array tools: searching, and sums that come out the same on any number of threads."""
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+
+def opaque_index(value):
+    """A UInt32 the compiler cannot see, so that another value does not mean another kernel."""
+    return dr.opaque(mi.UInt32, value)
+
+
+def concat(*arrays):
+    """The arrays (of one type, Color3f too) end to end."""
+    # dr.concat has the offsets in its kernels, and so compiles anew for every length.
+    widths = [dr.width(a) for a in arrays]
+    result, start = dr.empty(type(arrays[0]), sum(widths)), 0
+    for array, width in zip(arrays, widths):
+        if width:
+            dr.scatter(result, array, opaque_index(start) + dr.arange(mi.UInt32, width))
+        start += width
+    return result
+
+
+@dr.syntax
+def lower_bound(values, key, active=True):
+    """First position k of sorted ``values`` with values[k] >= key, at most the last one (UInt32 [n])."""
+    # dr.binary_search unrolls, and so compiles anew whenever the table has doubled.
+    low = dr.zeros(mi.UInt32, dr.width(key))
+    high = low + opaque_index(dr.width(values) - 1)
+    while low < high:
+        middle = (low + high) >> 1
+        below = dr.gather(type(values), values, middle, active) < key
+        low = dr.select(below, middle + 1, low)
+        high = dr.select(below, high, middle)
+    return low
+
+
+class ColorSums:
+    """Sums of colours in bins, in 64-bit fixed point: exact, so their order does not matter.
+
+    No sum may exceed ``bound`` (three floats, one per channel).
+    """
+
+    def __init__(self, bins, bound):
+        self.bins = bins
+        # Powers of two: a bound that differs in the last bit gives the same fixed point.
+        self.unit = [power_of_two(b) * 2.0 ** -60 for b in bound]
+        self._to_fixed = [dr.opaque(mi.Float64, 1 / u) for u in self.unit]
+        self._to_float = [dr.opaque(mi.Float64, u) for u in self.unit]
+        self._sums = [dr.zeros(mi.Int64, bins) for _ in range(3)]
+
+    def add(self, color, index, active=True):
+        """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n])."""
+        for sums, scale, value in zip(self._sums, self._to_fixed, color):
+            dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active)
+
+    def gather(self, index):
+        """The sums of bins ``index`` as three Float64 [n]."""
+        return [mi.Float64(dr.gather(mi.Int64, sums, index)) * scale for sums, scale in zip(self._sums, self._to_float)]
+
+    def totals(self):
+        """Sums over all bins, three Python floats."""
+        return [t * u for t, u in zip(totals(self._sums), self.unit)]
+
+
+def totals(arrays):
+    """Sums of several arrays, as Python floats, read in one go."""
+    sums = [dr.sum(a) for a in arrays]
+    dr.eval(sums)
+    return [s[0] for s in sums]
+
+
+def power_of_two(value):
+    """The smallest power of two ≥ ``value`` (1 for 0): scales by it round nothing."""
+    return 2.0 ** (math.frexp(value)[1] if value > 0 else 0)

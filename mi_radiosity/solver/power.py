@@ -1,0 +1,196 @@
+"""Distribution of power over the hierarchy: stochastic Jacobi radiosity with an exact ray budget."""
+from dataclasses import dataclass, field
+
+import drjit as dr
+import mitsuba as mi
+
+from ..scene.model import NONE
+from ..scene.sampling import kronecker, triangle
+from .arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
+
+TAIL = 0.01             # share of the power below which the rest is summed in closed form
+ITERATIONS = 64         # after so many the rest is summed in closed form, too
+WEIGHTS = 2.0 ** 46     # resolution of the ray distribution over elements
+
+
+@dataclass
+class Flow:
+    """What one power distribution did. Power in W per channel, irradiance in W/m² per element.
+
+    ``direct`` and ``indirect`` are Color3f [elements], right at the leaves and pulled to their
+    ancestors.
+    """
+    direct: "mi.Color3f" = None
+    indirect: "mi.Color3f" = None
+    rays: int = 0
+    iterations: int = 0
+    first_share: float = 1.0        # of the power shot in all, the lamps' part
+    emitted: list = field(default_factory=lambda: [0.0] * 3)
+    escaped: list = field(default_factory=lambda: [0.0] * 3)
+    blocked: list = field(default_factory=lambda: [0.0] * 3)    # absorbed by sides that reflect nothing
+    unshot: list = field(default_factory=lambda: [0.0] * 3)
+
+
+@dataclass
+class RayRecord:
+    """The rays of a pilot, to discover pairs with: source (j, uj, vj) to receiver (i, ui, vi)."""
+    i: "mi.UInt32"
+    ui: "mi.Float"
+    vi: "mi.Float"
+    j: "mi.UInt32"
+    uj: "mi.Float"
+    vj: "mi.Float"
+    pair: "mi.UInt32"       # where each ray stands in the pair tree, NONE before its root exists
+
+
+def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, progress=lambda done: None):
+    """Shoot all power of the scene over elements and pairs with ``rays`` rays. Returns a Flow.
+
+    B = E + ρ H is summed as the Neumann series Σ_k H_k of irradiances (eq. 1). Iteration k shoots
+    the power ρ H_(k−1) A that is unshot, with rays in proportion to it: systematic over the
+    elements, cosine-distributed, low-discrepancy in position and direction. A ray leaves its power
+    at the receiver of the first pair without children on its way down; where nobody has evaluated
+    that pair, at the leaf it meets.
+
+    The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration,
+    every later one takes 1 − λ of the rays left, so that all rays carry about the same power. Once
+    less than ``tail`` of the power is left, the last iteration stands for all that would follow,
+    H_k (1 + λ + λ² + …) (Lyusternik's closure): no power is lost however large ρ is.
+
+    record: a list that receives the RayRecord of every iteration; then power stays at unevaluated
+    pairs, which spreads it smoothly. progress is told the rays done so far.
+    Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
+    """
+    elements, model = pairs.elements, pairs.elements.model
+    leaves = elements.leaf_indices()
+    area = mi.Float64(dr.gather(mi.Float, elements.area, leaves))
+    reflectance = dr.gather(mi.Color3f, elements.reflectance, leaves)
+    emission = dr.gather(mi.Color3f, model.emission, dr.gather(mi.UInt32, elements.patch, leaves))
+    power = [mi.Float64(e) * area for e in emission]                # unshot, per channel [leaves]
+    direct, indirect = ([dr.zeros(mi.Float64, dr.width(leaves)) for _ in range(3)] for _ in range(2))
+
+    flow = Flow()
+    unshot = flow.emitted = totals(power)
+    share, left, shot = first_share, rays, 0.0
+    while left > 0 and sum(unshot) > 0:
+        last = flow.iterations > 0 and (flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted))
+        count = left if last else min(left, max(64, round(left * share)))
+        sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, rays - left, seed, record is not None)
+        if record is not None:
+            record.append(rays_seen)
+        left -= count
+        # Systematic sampling keeps the total only to a few rays: restore it exactly.
+        scale = [u / s if s > 0 else 0.0 for u, s in zip(unshot, sums.totals())]
+        received = _push(elements, sums, leaves, scale)
+        power = [h * mi.Float64(r) * area for h, r in zip(received, reflectance)]
+        after = totals(power)
+        closure = [1 / max(1 - a / u, 1e-6) if left == 0 and u > 0 else 1.0 for a, u in zip(after, unshot)]
+        first = flow.iterations == 0
+        for c in range(3):
+            once, more = received[c], received[c] * dr.opaque(mi.Float64, closure[c] - first)
+            direct[c], indirect[c] = (direct[c] + once, indirect[c] + more) if first else (direct[c], indirect[c] + more)
+            lost = [sums.gather(opaque_index(len(elements) + k))[c][0] * scale[c] * closure[c] for k in range(2)]
+            flow.escaped[c] += lost[0]
+            flow.blocked[c] += lost[1]
+        dr.eval(direct, indirect, power)
+        shot += sum(u * c for u, c in zip(unshot, closure))
+        share = 1 - min(sum(after) / sum(unshot), 0.999)
+        unshot = after if left else [0.0] * 3
+        flow.iterations += 1
+        progress(rays - left)
+    flow.rays, flow.unshot = rays - left, unshot
+    flow.first_share = sum(flow.emitted) / shot
+    flow.direct, flow.indirect = (_pull(elements, leaves, area, irradiance) for irradiance in (direct, indirect))
+    return flow
+
+
+def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
+    """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
+
+    Returns the sums per element, followed by two bins for power that escapes and that is blocked,
+    and the RayRecord if ``pilot``.
+    """
+    elements, model = pairs.elements, pairs.elements.model
+    # Integer weights: the distribution is the same on any number of threads.
+    scale = dr.opaque(mi.Float64, WEIGHTS / power_of_two(sum(unshot)))
+    weight = mi.UInt64(dr.ceil((power[0] + power[1] + power[2]) * scale))
+    cumulative = dr.cumsum(weight)
+    dr.eval(cumulative, weight)
+    whole = dr.gather(mi.UInt64, cumulative, dr.width(cumulative) - 1)[0]
+
+    ray = dr.arange(mi.UInt32, count)
+    key = opaque_index(seed)
+    jitter = mi.sample_tea_float32(opaque_index(first), key ^ 0x5EED)
+    spacing = dr.opaque(mi.Float64, whole / count)
+    k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
+    x0, x1, d0, d1 = kronecker(ray, opaque_index(first), key)
+    source = dr.gather(mi.UInt32, leaves, k)
+    j = dr.gather(mi.UInt32, elements.patch, source)
+    uj, vj = elements.patch_point(source, *triangle(x0, x1))
+    hit = model.trace(*model.leave(j, uj, vj, d0, d1))
+
+    on_patch = hit.patch != NONE
+    pair = pairs.find_roots(hit.patch, j, on_patch)
+    known = pair != NONE
+    pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
+    receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
+    if not pilot:
+        vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0)
+        receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
+    n = len(elements)
+    bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
+    each = spacing / mi.Float64(dr.gather(mi.UInt64, weight, k))
+    sums = ColorSums(n + 2, [2 * u for u in unshot])
+    sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin)
+    record = None
+    if pilot:
+        record = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
+        dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
+    return sums, record
+
+
+def _push(elements, sums, leaves, scale):
+    """Irradiance of leaves: what they and their ancestors received per area (3 Float64 [leaves])."""
+    received = _sum_ancestors(elements, sums, leaves)
+    result = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
+    dr.eval(result)
+    return result
+
+
+@dr.syntax
+def _sum_ancestors(elements, sums, leaves):
+    """Power over area, added up from the leaves to their roots (3 Float64 [leaves])."""
+    element, n = mi.UInt32(leaves), dr.width(leaves)
+    r, g, b = dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n)
+    climbing = dr.full(mi.Bool, True, n)
+    while climbing:
+        area = mi.Float64(dr.gather(mi.Float, elements.area, element))
+        x, y, z = sums.gather(element)
+        r, g, b = r + x / area, g + y / area, b + z / area
+        parent = dr.gather(mi.UInt32, elements.parent, element)
+        climbing = parent != element
+        element = parent
+    return [r, g, b]
+
+
+def _pull(elements, leaves, area, irradiance):
+    """Area averages of leaf irradiance for all elements (Color3f [elements])."""
+    power = [h * area for h in irradiance]
+    sums = ColorSums(len(elements), [2 * t for t in totals(power)])
+    _add_to_ancestors(elements, sums, leaves, power)
+    every = dr.arange(mi.UInt32, len(elements))
+    result = mi.Color3f(*(mi.Float(p / mi.Float64(elements.area)) for p in sums.gather(every)))
+    dr.eval(result)
+    return result
+
+
+@dr.syntax
+def _add_to_ancestors(elements, sums, leaves, power):
+    """Add the power of leaves to themselves and to all their ancestors."""
+    element = mi.UInt32(leaves)
+    climbing = dr.full(mi.Bool, True, dr.width(leaves))
+    while climbing:
+        sums.add(power, element, climbing)
+        parent = dr.gather(mi.UInt32, elements.parent, element)
+        climbing = parent != element
+        element = parent
