@@ -29,10 +29,11 @@ def choose_llvm():
     if not libraries:
         return
     # The wheel links its C++ runtime only at the next interpreter start: load it by hand until then.
+    # Locally: a global libc++abi would take over Mitsuba's exceptions, and its errors would abort.
     for name in ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1"):
         for path in _files(name)[:1]:
             try:
-                ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
+                ctypes.CDLL(path, mode=ctypes.RTLD_LOCAL)
             except OSError:
                 pass
     os.environ["DRJIT_LIBLLVM_PATH"] = libraries[0]

@@ -30,6 +30,16 @@ def writing(path):
             os.unlink(temporary)
 
 
+def check_writable(path):
+    """Raise RadiosityError now if ``path`` could not be written later."""
+    path = Path(path)
+    if path.is_dir():
+        raise RadiosityError(f"cannot write {path}: it is a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        why = "may not be written to" if path.parent.is_dir() else "does not exist"
+        raise RadiosityError(f"cannot write {path}: the folder {path.parent} {why}")
+
+
 def _umask():
     mask = os.umask(0)
     os.umask(mask)

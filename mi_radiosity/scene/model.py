@@ -93,6 +93,7 @@ class Model:
 
         self.corners = corners
         self.centre = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
+        self._rank = _canonical_rank(corners)
         self.offset = RAY_OFFSET * max(np.abs(corners).max(), np.finfo(np.float32).tiny)
         e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         cross = np.cross(e1, e2)
@@ -175,19 +176,21 @@ class Model:
         n = len(self.face_shape)
         sound = ~self.degenerate
         candidate = np.column_stack([sound, sound & self.two_sided]).ravel()    # [2 faces], front and back in turn
-        self.use_sides(np.flatnonzero(candidate))
+        sides = np.flatnonzero(candidate)
+        self.use_sides(np.sort(2 * self._rank[sides // 2] + sides % 2))
         reached = self._reached()
-        self.use_sides(np.flatnonzero(candidate)[reached])
+        self.use_sides(self.sides[reached])
         self.unreached = int((~reached).sum())
 
     def use_sides(self, sides):
-        """Patches are the given sides (int [patches]), side = 2 face + (1 for the back)."""
-        face, back = sides // 2, sides % 2
+        """Patches are the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
+        self.sides = sides
+        face, back = np.argsort(self._rank)[sides // 2], sides % 2
         sign = np.where(self._flipped[face] ^ (back == 1), -1.0, 1.0)
         table = np.full(2 * len(self.face_shape), NONE, dtype=np.uint32)
-        table[sides] = np.arange(len(sides))
+        table[2 * face + back] = np.arange(len(sides))
         def vector(kind, a): return kind(*(mi.Float(np.ascontiguousarray(a[:, k], dtype=np.float32)) for k in range(3)))
-        self.sides, self.count = sides, len(sides)
+        self.count, self._faces = len(sides), face
         self.face = mi.UInt32(face.astype(np.uint32))
         self.back = mi.Bool(back == 1)
         self.p0 = vector(mi.Point3f, (self.corners[:, 0] - self.centre)[face])
@@ -199,7 +202,7 @@ class Model:
         self.emission = vector(mi.Color3f, np.where((back == 0)[:, None], self._exitance[face], 0))
         self._side_patch = mi.UInt32(table)
         self._front = vector(mi.Vector3f, self._normal * np.where(self._flipped, -1.0, 1.0)[:, None])
-        self._origin = mi.Point3f(*(dr.opaque(mi.Float, c) for c in self.centre))
+        self.origin = mi.Point3f(*(dr.opaque(mi.Float, c) for c in self.centre))
         self._lift = dr.opaque(mi.Float, self.offset)
 
     def _reached(self):
@@ -236,14 +239,14 @@ class Model:
     def _fingerprint(self):
         """SHA-256 of geometry, orientation, reflectance and emission."""
         digest = hashlib.sha256()
-        for array in (self.corners.astype(np.float32), self._flipped, self.two_sided,
-                      np.round(self._rho, 4).astype(np.float32) + 0, self._exitance.astype(np.float32)):
-            digest.update(np.ascontiguousarray(array).tobytes())
+        order = np.argsort(self._rank)
+        for array in (self.corners, self._flipped, self.two_sided, np.round(self._rho, 4).swapaxes(0, 1) + 0, self._exitance):
+            digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
         return digest.hexdigest()
 
     def shape_of(self, patch):
         """How messages call the shape that patch number ``patch`` belongs to."""
-        index = self.face_shape[self.sides[patch] // 2]
+        index = self.face_shape[self._faces[patch]]
         return label(self.scene.shapes()[index], index)
 
     # ---- Rays ----------------------------------------------------------------------------------
@@ -253,10 +256,15 @@ class Model:
         return (dr.gather(mi.Point3f, self.p0, patch) + dr.gather(mi.Vector3f, self.e1, patch) * u
                 + dr.gather(mi.Vector3f, self.e2, patch) * v)
 
+    def corner(self, k):
+        """Corner k of all patches where the file has it, to the bit (Point3f [patches])."""
+        corner = self.corners[self._faces, k].astype(np.float32)
+        return mi.Point3f(*(mi.Float(np.ascontiguousarray(x)) for x in corner.T))
+
     def leave(self, patch, u, v, s, t):
         """Origin and cosine-distributed direction of rays that leave patches at (u, v)."""
         normal = dr.gather(mi.Vector3f, self.normal, patch)
-        origin = self.point(patch, u, v) + self._origin + normal * self._lift
+        origin = self.point(patch, u, v) + self.origin + normal * self._lift
         return origin, cosine_direction(normal, s, t)
 
     def trace(self, origin, direction):
@@ -284,7 +292,27 @@ class Model:
         cosines = dr.maximum(dr.dot(n_i, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
         faces = (cosines > 0) & (r2 > 0)
         start = x + n_i * self._lift
-        ray = mi.Ray3f(start + self._origin, (y + n_j * self._lift) - start)
+        ray = mi.Ray3f(start + self.origin, (y + n_j * self._lift) - start)
         ray.maxt = 1 - 1e-5
         seen = faces & ~self.tracing.ray_test(ray, active=faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
+
+
+def _canonical_rank(corners):
+    """Place of every face in an order that only geometry decides (int [faces]).
+
+    Mitsuba's order of shapes varies from one process to the next. Along a Morton curve, so that
+    neighbours in the order are neighbours in space; the bytes of the corners decide between equals.
+    """
+    centroid = corners.mean(axis=1)
+    low = centroid.min(axis=0)
+    cell = ((centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (2 ** 20 - 1)).astype(np.uint64)
+    morton = np.zeros(len(corners), dtype=np.uint64)
+    for bit in range(20):
+        for axis in range(3):
+            morton |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    words = np.ascontiguousarray(corners, dtype=np.float32).reshape(len(corners), 9).view(np.uint32).astype(np.uint64)
+    odd = np.uint64(0x9E3779B97F4A7C15) * (2 * np.arange(9, dtype=np.uint64) + np.uint64(1))
+    rank = np.empty(len(corners), dtype=np.int64)
+    rank[np.lexsort(((words * odd).sum(axis=1), morton))] = np.arange(len(corners))
+    return rank

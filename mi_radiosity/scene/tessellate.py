@@ -9,15 +9,16 @@ SEGMENTS = 32
 def disk_mesh(disk):
     """A fan of triangles with exactly the area of ``disk``, so that a lamp keeps its power."""
     angle = np.arange(SEGMENTS) / SEGMENTS
-    rim = disk.eval_parameterization(mi.Point2f(1.0, mi.Float(angle.astype(np.float32))))
-    middle = disk.eval_parameterization(mi.Point2f(0.0, 0.0))
-    centre = np.array(middle.p, dtype=np.float64).reshape(3)
+    # Half-way out: Mitsuba finds these points by tracing, and rays at the very rim may miss.
+    ring = disk.eval_parameterization(mi.Point2f(0.5, mi.Float(angle.astype(np.float32))))
+    points = np.array(ring.p, dtype=np.float64).reshape(3, -1).T
+    centre = points.mean(axis=0)
     radius = np.sqrt(2 * np.pi / SEGMENTS / np.sin(2 * np.pi / SEGMENTS))
-    outer = centre + radius * (np.array(rim.p, dtype=np.float64).reshape(3, -1).T - centre)
+    outer = centre + 2 * radius * (points - centre)
     vertices = np.vstack([centre, outer])
     first = np.arange(SEGMENTS) + 1
     second = first % SEGMENTS + 1
-    normal = np.array(middle.sh_frame.n).reshape(3)
+    normal = np.array(ring.sh_frame.n).reshape(3, -1)[:, 0]
     if np.dot(np.cross(outer[0] - centre, outer[1] - centre), normal) < 0:
         first, second = second, first
     faces = np.column_stack([np.zeros(SEGMENTS, int), first, second])

@@ -100,7 +100,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
         progress(rays - left)
     flow.rays, flow.unshot = rays - left, unshot
     flow.first_share = sum(flow.emitted) / shot
-    flow.direct, flow.indirect = (_pull(elements, leaves, area, irradiance) for irradiance in (direct, indirect))
+    flow.direct, flow.indirect = (pull(elements, leaves, area, irradiance) for irradiance in (direct, indirect))
     return flow
 
 
@@ -173,7 +173,7 @@ def _sum_ancestors(elements, sums, leaves):
     return [r, g, b]
 
 
-def _pull(elements, leaves, area, irradiance):
+def pull(elements, leaves, area, irradiance):
     """Area averages of leaf irradiance for all elements (Color3f [elements])."""
     power = [h * area for h in irradiance]
     sums = ColorSums(len(elements), [2 * t for t in totals(power)])

@@ -9,13 +9,14 @@ from ..oracles import GMI, Oracle
 from ..scene import Model
 from .arrays import totals
 from .elements import Elements
+from .gather import Starved
 from .pairs import Pairs
 from .power import distribute
 from .refine import Refinement
 from .solution import Solution
 
-ELEMENTS = 19_000           # default mesh: so many leaves, and as many as there are patches
-RAYS_PER_ELEMENT = 150      # default ray budget
+ELEMENTS = 19_000           # default mesh: so many leaves more than patches, or twice the patches
+RAYS_PER_ELEMENT = 300      # default ray budget
 
 
 def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=10, seed=0, progress=None):
@@ -23,8 +24,8 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more elements than the scene has patches. rays: rays that carry the power, used
-    exactly; 150 per element by default. lines: random lines S per pair for the oracle. seed: any
+    either, 19,000 more than the scene has patches, or twice the patches. rays: rays that carry the
+    power, used exactly; 300 per element by default. lines: random lines S per pair for the oracle. seed: any
     integer; the same seed gives the same solution. progress: called with (stage, done, total), stage
     being "refine" or "distribute" (total is None where it is not known).
 
@@ -50,7 +51,7 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
 
     model = scene if isinstance(scene, Model) else Model(scene)
     if epsilon is None and elements is None:
-        elements = ELEMENTS + model.count
+        elements = model.count + max(ELEMENTS, model.count)
     if elements is not None and elements < model.count:
         raise RadiosityError(f"the scene has {model.count} patches, so {elements} elements cannot be reached: ask for at least {model.count} --elements")
     seconds = {"scene": lap()}
@@ -61,17 +62,19 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
     refinement.run()
     seconds["refine"] = lap()
 
-    rays = rays or RAYS_PER_ELEMENT * tree.leaves
-    flow = distribute(pairs, int(rays), seed & 0xFFFFFFFF, first_share=refinement.first_share,
-                      progress=lambda done: report("distribute", done, int(rays)))
-    dr.eval(flow.direct, flow.indirect)
+    rays = int(rays or RAYS_PER_ELEMENT * tree.leaves)
+    starved = Starved(tree, rays, seed & 0xFFFFFFFF)
+    flow = distribute(pairs, rays - starved.rays, seed & 0xFFFFFFFF, first_share=refinement.first_share,
+                      progress=lambda done: report("distribute", done + starved.rays, rays))
+    power = _balance(tree, flow)
+    starved.feed(flow)
     seconds["distribute"] = lap()
     seconds["total"] = clock[-1] - clock[0]
 
     stats = {
-        "elements": tree.leaves, "patches": model.count, "pairs": pairs.evaluated, "rays": flow.rays,
+        "elements": tree.leaves, "patches": model.count, "pairs": pairs.evaluated, "rays": flow.rays + starved.rays,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0, "pilot_rays": refinement.rays,
-        "iterations": flow.iterations, "power": _balance(tree, flow), "seconds": seconds,
+        "iterations": flow.iterations, "power": power, "seconds": seconds,
         "epsilon": refinement.epsilon, "oracle": oracle.name, "alpha": oracle.alpha, "lines": pairs.lines, "seed": seed,
     }
     return Solution(model, tree, flow.direct, flow.indirect, stats)

@@ -1,0 +1,25 @@
+"""Pictures on disk."""
+import json
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import RadiosityError
+from ..files import writing
+
+
+def write_image(path, image, stats=None):
+    """Write a picture (mi.TensorXf [height, width, channels]): EXR linear, with ``stats`` in its
+    header; PNG as 8-bit sRGB. Raises RadiosityError if it cannot be written."""
+    if not np.isfinite(np.array(image)).all():
+        raise RadiosityError(f"{path} would hold values that are not numbers: the film or the scene has NaN")
+    bitmap = mi.Bitmap(image)
+    if str(path).lower().endswith(".png"):
+        bitmap = mi.util.convert_to_bitmap(image)
+    elif stats:
+        bitmap.metadata()["mi_radiosity"] = json.dumps(stats)
+    with writing(path) as temporary:
+        try:
+            bitmap.write(temporary)
+        except RuntimeError as error:
+            raise OSError(str(error)) from None
