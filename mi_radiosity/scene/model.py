@@ -280,6 +280,10 @@ class Model:
         patch = dr.gather(mi.UInt32, self._side_patch, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
         return Hit(valid, dr.select(valid, patch, NONE), prelim.prim_uv.x, prelim.prim_uv.y)
 
+    def blocked(self, ray, active):
+        """Does anything lie on the segments ``ray`` (Bool [n])?"""
+        return self.tracing.ray_test(ray, active=active)
+
     def kernel(self, i, ui, vi, j, uj, vj):
         """F(x, y) = V(x, y) cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n]).
 
@@ -294,7 +298,7 @@ class Model:
         start = x + n_i * self._lift
         ray = mi.Ray3f(start + self.origin, (y + n_j * self._lift) - start)
         ray.maxt = 1 - 1e-5
-        seen = faces & ~self.tracing.ray_test(ray, active=faces)
+        seen = faces & ~self.blocked(ray, faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
 
 

@@ -52,8 +52,9 @@ class ColorSums:
 
     def add(self, color, index, active=True):
         """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n])."""
+        # Dr.Jit's own choice, Expand, has the number of bins in the kernel.
         for sums, scale, value in zip(self._sums, self._to_fixed, color):
-            dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active)
+            dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active, mode=dr.ReduceMode.Direct)
 
     def gather(self, index):
         """The sums of bins ``index`` as three Float64 [n]."""

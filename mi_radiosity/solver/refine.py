@@ -114,7 +114,7 @@ class Refinement:
         e = self.elements
         worst = dr.zeros(mi.UInt32, len(e))
         # Floats ≥ 0 sort like their bits, and a maximum does not depend on the order.
-        dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE)
+        dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE, mode=dr.ReduceMode.Local)
         worst = dr.reinterpret_array(mi.Float, worst)
         peak = dr.max(value)[0] if dr.width(value) else 0.0
         least = max(self.floor or 0.0, REACH * peak)

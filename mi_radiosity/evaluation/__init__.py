@@ -1,0 +1,1 @@
+"""Judging solutions: path-traced references, metrics, comparisons, benchmarks."""
