@@ -13,6 +13,12 @@ LINE_WIDTH = 1.0        # pixels
 LINE_SHADE = 0.25       # of the picture under an element outline
 
 
+def _checked_shading(name):
+    if name not in SHADINGS:
+        raise RadiosityError(f"unknown shading '{name}': choose one of {', '.join(SHADINGS)}")
+    return name
+
+
 def _integrator_class():
     """The class for the active variant: Mitsuba's base class is another one in each."""
     class RadiosityIntegrator(mi.SamplingIntegrator):
@@ -27,13 +33,11 @@ def _integrator_class():
 
         def __init__(self, props):
             super().__init__(props)
-            self.shading = props.get("shading", "gouraud")
-            if self.shading not in SHADINGS:
-                raise RadiosityError(f"unknown shading '{self.shading}': choose one of {', '.join(SHADINGS)}")
-            alpha = props.get("alpha") if props.has_property("alpha") else None
+            self.shading = _checked_shading(props.get("shading", "gouraud"))
+            alpha = props.get("alpha") if "alpha" in props else None
             self.options = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
             for name, kind in (("elements", int), ("epsilon", float), ("rays", int), ("lines", int), ("seed", int)):
-                if props.has_property(name):
+                if name in props:
                     self.options[name] = kind(props.get(name))
             self.progress = None
             self.pixel = 1.0        # width of a pixel in units of the ray differentials
@@ -126,6 +130,6 @@ def render(solution, sensor=0, spp=16, shading="gouraud", seed=0):
         if not 0 <= sensor < len(scene.sensors()):
             raise RadiosityError(f"there is no sensor {sensor}: the scene has {len(scene.sensors())}, counted from 0")
         sensor = scene.sensors()[sensor]
-    integrator = mi.load_dict({"type": "radiosity", "shading": shading})
+    integrator = mi.load_dict({"type": "radiosity", "shading": _checked_shading(shading)})
     integrator.show(solution)
     return integrator.render(scene, sensor, seed=seed, spp=spp)

@@ -107,7 +107,7 @@ class Model:
         self._e1, self._e2 = e1, e2
         self._area = double_area / 2
         self._normal = cross / np.where(self.degenerate, 1, double_area)[:, None]
-        self.first_face = mi.UInt32(np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.uint32))
+        self.first_face = owned(mi.UInt32, np.concatenate([[0], np.cumsum(counts)[:-1]]))
         self._face_prim = (np.arange(len(corners)) - np.repeat(np.cumsum(counts) - counts, counts))
 
     def _refuse(self, bad, shapes, why):
@@ -135,8 +135,8 @@ class Model:
         return mi.Color3f(si.bsdf().eval_diffuse_reflectance(si))
 
     def _read_materials(self, shapes):
-        self._prim = mi.UInt32(self._face_prim.astype(np.uint32))
-        self._shape = mi.UInt32(self.face_shape.astype(np.uint32))
+        self._prim = owned(mi.UInt32, self._face_prim)
+        self._shape = owned(mi.UInt32, self.face_shape)
         n = len(self.face_shape)
         face, third = dr.arange(mi.UInt32, n), dr.full(mi.Float, 1 / 3, n)
         si = self.surface(face, third, third)
@@ -189,18 +189,18 @@ class Model:
         sign = np.where(self._flipped[face] ^ (back == 1), -1.0, 1.0)
         table = np.full(2 * len(self.face_shape), NONE, dtype=np.uint32)
         table[2 * face + back] = np.arange(len(sides))
-        def vector(kind, a): return kind(*(mi.Float(np.ascontiguousarray(a[:, k], dtype=np.float32)) for k in range(3)))
+        def vector(kind, a): return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
         self.count, self._faces = len(sides), face
-        self.face = mi.UInt32(face.astype(np.uint32))
-        self.back = mi.Bool(back == 1)
+        self.face = owned(mi.UInt32, face)
+        self.back = owned(mi.UInt32, back) == 1
         self.p0 = vector(mi.Point3f, (self.corners[:, 0] - self.centre)[face])
         self.e1, self.e2 = vector(mi.Vector3f, self._e1[face]), vector(mi.Vector3f, self._e2[face])
         self.normal = vector(mi.Vector3f, self._normal[face] * sign[:, None])
-        self.area = mi.Float(self._area[face].astype(np.float32))
+        self.area = owned(mi.Float, self._area[face])
         self.total_area = float(self._area[face].sum())
         self.reflectance = vector(mi.Color3f, self._rho[back, face])
         self.emission = vector(mi.Color3f, np.where((back == 0)[:, None], self._exitance[face], 0))
-        self._side_patch = mi.UInt32(table)
+        self._side_patch = owned(mi.UInt32, table)
         self._front = vector(mi.Vector3f, self._normal * np.where(self._flipped, -1.0, 1.0)[:, None])
         self.origin = mi.Point3f(*(dr.opaque(mi.Float, c) for c in self.centre))
         self._lift = dr.opaque(mi.Float, self.offset)
@@ -226,8 +226,8 @@ class Model:
             each = -(-LAMP_PROBES // len(lamps))
             more = np.repeat(lamps, each)
             source = np.concatenate([source, more])
-            number = mi.UInt32(np.tile(np.arange(each), len(lamps)).astype(np.uint32))
-            target = np.concatenate([target, cast(mi.UInt32(more.astype(np.uint32)), number)])
+            number = owned(mi.UInt32, np.tile(np.arange(each), len(lamps)))
+            target = np.concatenate([target, cast(owned(mi.UInt32, more), number)])
         source, target = source[target != NONE], target[target != NONE]
         reached, before = emits, 0
         while reached.sum() > before:
@@ -259,7 +259,7 @@ class Model:
     def corner(self, k):
         """Corner k of all patches where the file has it, to the bit (Point3f [patches])."""
         corner = self.corners[self._faces, k].astype(np.float32)
-        return mi.Point3f(*(mi.Float(np.ascontiguousarray(x)) for x in corner.T))
+        return mi.Point3f(*(owned(mi.Float, x) for x in corner.T))
 
     def leave(self, patch, u, v, s, t):
         """Origin and cosine-distributed direction of rays that leave patches at (u, v)."""
@@ -300,6 +300,19 @@ class Model:
         ray.maxt = 1 - 1e-5
         seen = faces & ~self.blocked(ray, faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
+
+
+def owned(kind, array):
+    """A Dr.Jit array (mi.Float or mi.UInt32) with a copy of a NumPy array of one dimension.
+
+    Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
+    """
+    kept = np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32)
+    copy = dr.empty(kind, len(kept))
+    if len(kept):
+        dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))
+        dr.eval(copy)
+    return copy
 
 
 def _canonical_rank(corners):

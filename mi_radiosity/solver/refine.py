@@ -43,9 +43,10 @@ class Refinement:
         while True:
             fresh = self._ask()
             pairs, value, element = self._candidates()
-            room = self._room()
+            room = self._room() if dr.width(pairs) else 0
             split = self._split_elements(value, element, room) if room else 0
-            split += self._split_pairs(pairs, value, element)
+            if dr.width(pairs):
+                split += self._split_pairs(pairs, value, element)
             self.progress(self.elements.leaves)
             if not fresh and not split:
                 break
@@ -76,6 +77,8 @@ class Refinement:
         self.radiosity = emission + self.elements.reflectance * (flow.direct + flow.indirect)
         dr.eval(self.radiosity)
         hits = self.hits
+        if dr.width(hits.i) == 0:
+            return
         unknown = dr.compress(hits.pair == NONE)
         self.pairs.add_roots(dr.gather(mi.UInt32, hits.i, unknown), dr.gather(mi.UInt32, hits.j, unknown))
         roots = self.pairs.find_roots(hits.i, hits.j, hits.pair == NONE)
@@ -85,6 +88,8 @@ class Refinement:
     def _ask(self):
         """Evaluate the pairs the rays stand at; returns how many were new."""
         hits = self.hits
+        if dr.width(hits.i) == 0:
+            return 0
         hits.pair = self.pairs.descend(hits.pair, hits.ui, hits.vi, hits.uj, hits.vj)
         dr.eval(hits.pair)
         visited = dr.zeros(mi.Bool, len(self.pairs))
@@ -100,6 +105,8 @@ class Refinement:
         """Pairs that could be split: their numbers, the value ρ_i σ_ij B_j, and which element would split."""
         p = self.pairs
         open_pairs = dr.compress((p.child == 0) & (p.sigma > 0))
+        if dr.width(open_pairs) == 0:
+            return open_pairs, mi.Float(), mi.UInt32()
         value = dr.gather(mi.Float, p.sigma, open_pairs)
         if self.oracle.weighted:
             reflectance = dr.gather(mi.Color3f, self.elements.reflectance, dr.gather(mi.UInt32, p.receiver, open_pairs))
@@ -116,7 +123,7 @@ class Refinement:
         # Floats ≥ 0 sort like their bits, and a maximum does not depend on the order.
         dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE, mode=dr.ReduceMode.Local)
         worst = dr.reinterpret_array(mi.Float, worst)
-        peak = dr.max(value)[0] if dr.width(value) else 0.0
+        peak = dr.max(value)[0]
         least = max(self.floor or 0.0, REACH * peak)
         leaves = dr.compress((e.child == 0) & (worst > 0) & (worst >= dr.opaque(mi.Float, least)))
         count = min(dr.width(leaves), max(LEAST_SPLITS, round(GROWTH * e.leaves)), room)

@@ -9,6 +9,7 @@ import numpy as np
 from ..errors import RadiosityError
 from ..files import writing
 from ..scene import Model
+from ..scene.model import owned
 from .elements import Elements
 
 FORMAT = 1
@@ -78,8 +79,8 @@ class Solution:
         elements = Elements(model)
         for name in TREE:
             kind = mi.UInt32 if data[name].dtype.kind == "u" else mi.Float
-            setattr(elements, name, kind(data[name]))
-        def color(name): return mi.Color3f(*(mi.Float(np.ascontiguousarray(c)) for c in data[name]))
+            setattr(elements, name, owned(kind, data[name]))
+        def color(name): return mi.Color3f(*(owned(mi.Float, c) for c in data[name]))
         elements.reflectance = color("reflectance")
         elements.area = dr.gather(mi.Float, model.area, elements.patch) * elements.scale ** 2
         elements.leaves = int((data["child"] == 0).sum())
