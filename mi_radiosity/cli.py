@@ -46,6 +46,29 @@ def _parser():
     render.add_argument("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")
     render.set_defaults(command=_render)
 
+    reference = commands.add_parser("reference", help="path-trace a reference; resumes, never starts over")
+    _scene_arguments(reference)
+    reference.add_argument("-o", "--output", required=True, type=Path, metavar="REF.exr", help="with several views the view's number is added to the name")
+    reference.add_argument("--spp", type=_positive, default=1024, metavar="N", help="samples per pixel in all (default 1024)")
+    reference.add_argument("--view", default="0", metavar="K|all")
+    reference.add_argument("--seed", type=int, default=0, metavar="K")
+    reference.set_defaults(command=_reference)
+
+    compare = commands.add_parser("compare", help="compare oracles: error beside cost, against a path-traced reference")
+    _scene_arguments(compare)
+    compare.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="table.md, results.json, figure.png, report.html; an interrupted run goes on")
+    compare.add_argument("--oracles", default=None, metavar="LIST", help="such as ks,gmi:1.5,mi,gmi:0.5 (default: the rows of the paper's table 1)")
+    compare.add_argument("--elements", type=_positive, default=19_000, metavar="N")
+    compare.add_argument("--rays", type=_positive, default=2_684_000, metavar="N")
+    compare.add_argument("--lines", type=_positive, default=10, metavar="S")
+    compare.add_argument("--seeds", type=_positive, default=5, metavar="N", help="repetitions (default 5)")
+    compare.add_argument("--view", default="all", metavar="K|all")
+    compare.add_argument("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel of our pictures (default 64)")
+    compare.add_argument("--reference-spp", type=_positive, default=1024, metavar="N")
+    compare.add_argument("--questions", default="mesh,rays,time,noise", metavar="LIST", help="which budgets are equal: mesh, rays, time; noise splits the error")
+    compare.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster there (needs mi_radiosity[dask])")
+    compare.set_defaults(command=_compare)
+
     info = commands.add_parser("info", help="say what of a scene would be modelled, what not and why")
     _scene_arguments(info)
     info.set_defaults(command=_info)
@@ -110,12 +133,44 @@ def _render(arguments):
                 Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
         for number, view in enumerate(views):
             report("render", number, len(views))
-            name = output if len(views) == 1 else output.with_name(f"{output.stem}_{view}{output.suffix}")
-            write_image(name, render(solution, view, spp=arguments.spp, shading=arguments.shading), solution.stats)
+            write_image(view_name(output, view, views), render(solution, view, spp=arguments.spp, shading=arguments.shading), solution.stats)
             report("render", number + 1, len(views))
     s = solution.stats
     print(f"{s['elements']:,} elements, {s['pairs']:,} pairs, {s['rays']:,} rays, {s['oracle_rays']:,} oracle rays, "
           f"{'loaded' if arguments.load else format(s['seconds']['total'], '.2f') + ' s'}")
+
+
+def _reference(arguments):
+    from .evaluation.reference import render_reference
+    if arguments.output.suffix.lower() != ".exr":
+        raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .exr")
+    check_writable(arguments.output)
+    scene = load_scene(arguments)
+    views = choose_views(scene, arguments.view)
+    with progress_bars() as report:
+        for view in views:
+            path = view_name(arguments.output, view, views)
+            result = render_reference(scene, scene.sensors()[view], path, arguments.spp, arguments.seed,
+                                      lambda done, total, view=view: report(f"path tracing view {view}", done, total))
+            print(f"{path}: {sum(result.spp)} samples per pixel, its own RMSE_a is {result.noise():.3f}")
+
+
+def _compare(arguments):
+    from .evaluation.compare import PAPER, QUESTIONS, compare_oracles
+    questions = arguments.questions.split(",")
+    if unknown := set(questions) - set(QUESTIONS):
+        raise RadiosityError(f"--questions {', '.join(unknown)}: choose from {', '.join(QUESTIONS)}")
+    if "mesh" not in questions:
+        raise RadiosityError("--questions: the others are measured against 'mesh', name it too")
+    scene = load_scene(arguments)
+    views = choose_views(scene, arguments.view)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    with progress_bars() as report:
+        compare_oracles(arguments.scene, arguments.output, variant=arguments.mode, definitions=tuple(parse_definitions(arguments.define).items()),
+                        oracles=arguments.oracles or PAPER, elements=arguments.elements, rays=arguments.rays, lines=arguments.lines, seeds=arguments.seeds,
+                        views=tuple(views), spp=arguments.spp, reference_spp=arguments.reference_spp,
+                        questions=tuple(q for q in QUESTIONS if q in questions), scheduler=arguments.scheduler, progress=report)
+    print((arguments.output / "table.md").read_text())
 
 
 def _info(arguments):
@@ -163,12 +218,7 @@ def load_scene(arguments):
         raise RadiosityError(f"unknown variant '{arguments.mode}': choose one of {', '.join(mi.variants())}")
     if not arguments.scene.is_file():
         raise RadiosityError(f"the scene {arguments.scene} does not exist: check the path")
-    definitions = {}
-    for text in arguments.define:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise RadiosityError(f"-D {text}: write it as KEY=VALUE")
-        definitions[key] = value
+    definitions = parse_definitions(arguments.define)
     from .scene.model import require_variant
     mi.set_log_level(mi.LogLevel.Error)
     mi.set_variant(arguments.mode)
@@ -180,6 +230,22 @@ def load_scene(arguments):
     if not isinstance(scene, mi.Scene):
         raise RadiosityError(f"{arguments.scene} holds no <scene>: give a scene file")
     return scene
+
+
+def parse_definitions(texts):
+    """-D options as {key: value}."""
+    definitions = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise RadiosityError(f"-D {text}: write it as KEY=VALUE")
+        definitions[key] = value
+    return definitions
+
+
+def view_name(path, view, views):
+    """``path`` itself, or with the number of the view if there are several."""
+    return path if len(views) == 1 else path.with_name(f"{path.stem}_{view}{path.suffix}")
 
 
 def choose_views(scene, text):

@@ -1,0 +1,86 @@
+"""How far an image is from a reference that is noisy itself."""
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+PERCEPTUAL = (0.2126, 0.7152, 0.0722)       # Rec. 709 luminance, as in sRGB
+LAGS = 3                                    # pixels over which a reconstruction filter correlates noise
+
+
+def srgb(image):
+    """Linear radiance ─► 0…255 sRGB-encoded, clipped but not rounded (float64)."""
+    x = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
+    return 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def mean_square(difference, weights=(1 / 3, 1 / 3, 1 / 3)):
+    """Mean over pixels of the weighted squares of [height, width, 3] differences."""
+    return float((difference ** 2 @ np.asarray(weights)).mean())
+
+
+def rmse(a, b, weights=(1 / 3, 1 / 3, 1 / 3)):
+    """Root mean square error of two linear images, measured as 8-bit sRGB (0…255)."""
+    return mean_square(srgb(a) - srgb(b), weights) ** 0.5
+
+
+def psnr(error):
+    """Peak signal-to-noise ratio of an RMSE: 20 log10(255 / RMSE), in dB."""
+    return float(20 * np.log10(255 / error)) if error > 0 else float("inf")
+
+
+def relative_error(image, reference):
+    """relMSE, linear, for HDR: mean of (x − r)² / (r² + 0.01)."""
+    x, r = np.asarray(image, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    return float(((x - r) ** 2 / (r ** 2 + 0.01)).mean())
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of an image. _a weighs channels equally, _p by luminance; ``clean`` is RMSE_a with the
+    reference's noise removed, ± ``clean_error`` (one standard error of what that noise decides)."""
+    rmse_a: float
+    rmse_p: float
+    psnr_a: float
+    psnr_p: float
+    rel_mse: float
+    rmse_a_clean: float
+    rmse_a_clean_error: float
+
+    def asdict(self):
+        return asdict(self)
+
+
+def compare(image, halves):
+    """Errors of ``image`` against a reference in two independent halves ([2, height, width, 3], linear).
+
+    With x the image, r₀ and r₁ the halves, all sRGB-encoded, the mean of (x − r₀)(x − r₁) is
+    RMSE² − noise² to the letter, and free of the reference's noise in expectation: the two noises
+    are independent. Its variance follows from the noise of every pixel, (r₀ − r₁)²/2, and from how
+    far the film's filter spreads it.
+    """
+    reference = np.mean(halves, axis=0)
+    x, r0, r1 = srgb(image), srgb(halves[0]), srgb(halves[1])
+    error_a, error_p = rmse(image, reference), rmse(image, reference, PERCEPTUAL)
+    product = (x - r0) * (x - r1)
+    noise = (r0 - r1) ** 2 / 2                          # variance of each half, per pixel
+    error = x - (r0 + r1) / 2
+    variance = (2 * error ** 2 * noise + noise ** 2).sum() / noise.size ** 2 * correlated_pixels(r0 - r1) * 3
+    clean = float(max(product.mean(), 0.0) ** 0.5)
+    return Errors(error_a, error_p, psnr(error_a), psnr(error_p), relative_error(image, reference),
+                  clean, float(variance ** 0.5 / (2 * max(clean, 1e-9))))
+
+
+def reference_noise(halves):
+    """RMSE_a of a reference itself, estimated from its halves: half the RMSE between them."""
+    return rmse(halves[0], halves[1]) / 2
+
+
+def correlated_pixels(difference):
+    """Sum of the autocorrelation of noise [height, width, 3] over neighbours: pixels that err together."""
+    total, power = 0.0, float((difference ** 2).mean())
+    if power == 0:
+        return 1.0
+    for dy in range(-LAGS, LAGS + 1):
+        for dx in range(-LAGS, LAGS + 1):
+            total += float((difference * np.roll(difference, (dy, dx), axis=(0, 1))).mean()) / power
+    return max(total, 1.0)
