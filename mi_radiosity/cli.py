@@ -69,6 +69,17 @@ def _parser():
     compare.add_argument("--scheduler", metavar="ADDRESS", help="run on the Dask cluster there (needs mi_radiosity[dask])")
     compare.set_defaults(command=_compare)
 
+    bench = commands.add_parser("bench", help="error against time: ours, path, and path with a denoiser")
+    _scene_arguments(bench)
+    bench.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="bench.json and error_time.png")
+    bench.add_argument("--elements", type=_positive, default=19_000, metavar="N", help="middle of the ladder of budgets")
+    bench.add_argument("--rays", type=_positive, default=2_684_000, metavar="N")
+    bench.add_argument("--view", default="0", metavar="K")
+    bench.add_argument("--views", type=_positive, default=16, metavar="N", help="views of the camera path (default 16)")
+    bench.add_argument("--reference-spp", type=_positive, default=1024, metavar="N")
+    bench.add_argument("--path-spp", type=_positive, default=1024, metavar="N", help="most samples per pixel of path (default 1024)")
+    bench.set_defaults(command=_bench)
+
     info = commands.add_parser("info", help="say what of a scene would be modelled, what not and why")
     _scene_arguments(info)
     info.set_defaults(command=_info)
@@ -164,13 +175,32 @@ def _compare(arguments):
         raise RadiosityError("--questions: the others are measured against 'mesh', name it too")
     scene = load_scene(arguments)
     views = choose_views(scene, arguments.view)
-    arguments.output.mkdir(parents=True, exist_ok=True)
+    make_folder(arguments.output)
     with progress_bars() as report:
         compare_oracles(arguments.scene, arguments.output, variant=arguments.mode, definitions=tuple(parse_definitions(arguments.define).items()),
                         oracles=arguments.oracles or PAPER, elements=arguments.elements, rays=arguments.rays, lines=arguments.lines, seeds=arguments.seeds,
                         views=tuple(views), spp=arguments.spp, reference_spp=arguments.reference_spp,
                         questions=tuple(q for q in QUESTIONS if q in questions), scheduler=arguments.scheduler, progress=report)
     print((arguments.output / "table.md").read_text())
+
+
+def _bench(arguments):
+    from .evaluation.bench import PATH_SPP, run_bench
+    scene = load_scene(arguments)
+    if arguments.view == "all":
+        raise RadiosityError("--view all: bench looks from one sensor, name its number")
+    view, = choose_views(scene, arguments.view)
+    make_folder(arguments.output)
+    with progress_bars() as report:
+        results = run_bench(arguments.scene, arguments.output, elements=arguments.elements, rays=arguments.rays, view=view, reference_spp=arguments.reference_spp,
+                            path_spp=tuple(s for s in PATH_SPP if s <= arguments.path_spp), views=arguments.views, progress=report)
+    tracing = results["tracing"]
+    print(f"solve: {tracing['warm_seconds']:.2f} s warm, {tracing['cold_seconds']:.1f} s cold, {tracing['solve_over_tracing']:.2f} times tracing its rays, {tracing['peak_megabytes']:.0f} MB")
+    for name, title in (("one", "one view"), ("many", f"{arguments.views} views")):
+        for other, where in results.get(name, {}).get("crossing", {}).items():
+            print(f"{title}: RMSE_a {where['rmse_a']:.2f} takes us {where['ours_seconds']:.2f} s and {other} {where['other_seconds']:.2f} s; "
+                  + (f"{other} is better from {where['seconds']:.1f} s on" if where["seconds"] else f"{other} is never better in the time measured"))
+    print(arguments.output / "bench.json")
 
 
 def _info(arguments):
@@ -230,6 +260,14 @@ def load_scene(arguments):
     if not isinstance(scene, mi.Scene):
         raise RadiosityError(f"{arguments.scene} holds no <scene>: give a scene file")
     return scene
+
+
+def make_folder(path):
+    """Make a folder for output, or say why not."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RadiosityError(f"cannot write into {path} ({error.strerror}): choose another folder") from None
 
 
 def parse_definitions(texts):

@@ -159,8 +159,8 @@ def executor_for(scheduler):
         raise RadiosityError(f"no Dask scheduler answers at {scheduler} ({error}): check the address") from None
 
 
-def run_cells(cells, executor, finished, progress=lambda done, total: None):
-    """Run cells through a concurrent.futures.Executor, telling ``finished(cell, result)`` of each.
+def run_cells(cells, executor, finished, progress=lambda done, total: None, work=run_cell):
+    """Run ``work(cell)`` through a concurrent.futures.Executor, telling ``finished(cell, result)`` of each.
 
     A cell whose worker fails is tried once more; if that fails too the run goes on without it.
     Returns {cell: error} of the cells that are missing. RadiosityError ends the run.
@@ -170,7 +170,7 @@ def run_cells(cells, executor, finished, progress=lambda done, total: None):
     while queue or pending:
         while queue and len(pending) < most:
             cell = queue.pop(0)
-            pending[executor.submit(run_cell, cell)] = cell
+            pending[executor.submit(work, cell)] = cell
         for future in wait(pending, return_when=FIRST_COMPLETED).done:
             cell, error = pending.pop(future), future.exception()
             if error is None:

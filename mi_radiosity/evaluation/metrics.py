@@ -55,32 +55,28 @@ def compare(image, halves):
 
     With x the image, r₀ and r₁ the halves, all sRGB-encoded, the mean of (x − r₀)(x − r₁) is
     RMSE² − noise² to the letter, and free of the reference's noise in expectation: the two noises
-    are independent. Its variance follows from the noise of every pixel, (r₀ − r₁)²/2, and from how
-    far the film's filter spreads it.
+    are independent. With e = x − (r₀ + r₁)/2 and d = r₀ − r₁, the square of q = e·d, averaged over
+    channels, is an unbiased estimate of a pixel's variance; products of neighbouring q account for
+    the film's filter, which spreads noise over LAGS pixels.
     """
     reference = np.mean(halves, axis=0)
     x, r0, r1 = srgb(image), srgb(halves[0]), srgb(halves[1])
     error_a, error_p = rmse(image, reference), rmse(image, reference, PERCEPTUAL)
-    product = (x - r0) * (x - r1)
-    noise = (r0 - r1) ** 2 / 2                          # variance of each half, per pixel
-    error = x - (r0 + r1) / 2
-    variance = (2 * error ** 2 * noise + noise ** 2).sum() / noise.size ** 2 * correlated_pixels(r0 - r1) * 3
-    clean = float(max(product.mean(), 0.0) ** 0.5)
+    clean = float(max(((x - r0) * (x - r1)).mean(), 0.0) ** 0.5)
+    q = ((x - (r0 + r1) / 2) * (r0 - r1)).mean(axis=2)
+    variance = max(_sum_of_neighbours(q), float((q ** 2).sum())) / q.size ** 2
     return Errors(error_a, error_p, psnr(error_a), psnr(error_p), relative_error(image, reference),
-                  clean, float(variance ** 0.5 / (2 * max(clean, 1e-9))))
+                  clean, variance ** 0.5 / (2 * max(clean, 1e-9)))
+
+
+def _sum_of_neighbours(q):
+    """Σ q(p) q(p + lag) over pixels p and all lags within LAGS."""
+    padded = np.pad(q, LAGS)
+    height, width = q.shape
+    return float(sum((q * padded[LAGS + dy:LAGS + dy + height, LAGS + dx:LAGS + dx + width]).sum()
+                     for dy in range(-LAGS, LAGS + 1) for dx in range(-LAGS, LAGS + 1)))
 
 
 def reference_noise(halves):
     """RMSE_a of a reference itself, estimated from its halves: half the RMSE between them."""
     return rmse(halves[0], halves[1]) / 2
-
-
-def correlated_pixels(difference):
-    """Sum of the autocorrelation of noise [height, width, 3] over neighbours: pixels that err together."""
-    total, power = 0.0, float((difference ** 2).mean())
-    if power == 0:
-        return 1.0
-    for dy in range(-LAGS, LAGS + 1):
-        for dx in range(-LAGS, LAGS + 1):
-            total += float((difference * np.roll(difference, (dy, dx), axis=(0, 1))).mean()) / power
-    return max(total, 1.0)

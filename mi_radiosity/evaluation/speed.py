@@ -49,11 +49,11 @@ def measure(path, elements, rays, runs=7):
     """
     cold = _cold_seconds(path, elements, rays)
     scene = mi.load_file(str(path))
-    solve(scene, elements=elements, rays=rays)
+    patches = solve(scene, elements=elements, rays=rays).stats["patches"]
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for seed, factor in ((1, 1), (2, .5), (3, 2)):
-            solve(scene, elements=int(elements * factor), rays=int(rays * factor), seed=seed)
+            solve(scene, elements=max(patches, int(elements * factor)), rays=int(rays * factor), seed=seed)
         compiled = sum(not k["cache_hit"] for k in dr.kernel_history((dr.KernelType.JIT,)))
     dr.kernel_history_clear()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
