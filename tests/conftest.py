@@ -37,3 +37,43 @@ def leaf_values(solution, name="radiosity"):
     leaves = np.flatnonzero(np.array(solution.elements.child) == 0)
     values = np.array(getattr(solution, name)()).reshape(3, -1).T[leaves]
     return values, np.array(solution.elements.area)[leaves], np.array(solution.elements.patch)[leaves]
+
+
+def mesh(vertices, faces, bsdf=None, emitter=None, name=""):
+    """A triangle mesh of vertices [n, 3] and faces [m, 3] without vertex normals; normals follow the right hand."""
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf or diffuse())
+    if emitter:
+        properties["emitter"] = mi.load_dict(emitter)
+    shape = mi.Mesh(name, len(vertices), len(faces), props=properties)
+    params = mi.traverse(shape)
+    params["vertex_positions"] = np.asarray(vertices, dtype=np.float32).ravel()
+    params["faces"] = np.asarray(faces, dtype=np.uint32).ravel()
+    params.update()
+    return shape
+
+
+def quad(corners, **parts):
+    """Two triangles over four corners, counter-clockwise as seen from the side they face."""
+    return mesh(corners, [[0, 1, 2], [0, 2, 3]], **parts)
+
+
+def icosphere(subdivisions, inwards=True):
+    """(vertices, faces) of a unit sphere made of 20 · 4^subdivisions triangles."""
+    g = (1 + 5 ** .5) / 2
+    vertices = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
+    faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
+             (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)]
+    corners = np.array(vertices)[np.array(faces)] / np.sqrt(1 + g * g)
+    for _ in range(subdivisions):
+        a, b, c = corners.transpose(1, 0, 2)
+        ab, bc, ca = (x / np.linalg.norm(x, axis=1)[:, None] for x in (a + b, b + c, c + a))
+        corners = np.concatenate([np.stack(t, axis=1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    vertices, index = np.unique(corners.reshape(-1, 3).round(12), axis=0, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    return vertices, faces[:, ::-1] if inwards else faces
+
+
+def group(model, reflectance):
+    """Numbers of the patches with a reflectance (UInt32 NumPy array): how tests tell surfaces apart."""
+    return np.flatnonzero(np.isclose(np.array(model.reflectance)[0], reflectance, atol=1e-6)).astype(np.uint32)

@@ -56,6 +56,8 @@ def information_gap(F, alpha):
     alpha = _checked(alpha)
     if not isinstance(F, KernelSamples):
         F = _samples(F)
+    if F.pairs == 0:
+        return mi.Float64()
     alpha = dr.opaque(mi.Float64, alpha)
     mean = F.mean()
     scale = dr.select(mean > 0, mean, 1)

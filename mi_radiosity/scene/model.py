@@ -8,7 +8,7 @@ import numpy as np
 
 from .. import _llvm
 from ..errors import RadiosityError
-from .sampling import cosine_direction, kronecker, triangle
+from .sampling import ROUNDS, cosine_direction, kronecker, triangle
 from .support import is_textured, label, require_supported
 from .tessellate import disk_mesh
 
@@ -209,7 +209,8 @@ class Model:
         """Which patches exchange light, directly or over others, with a lamp (bool [patches])?
 
         Every patch casts PROBES rays and the lamps LAMP_PROBES; light spreads along them, in both
-        directions, until nothing new is reached.
+        directions, until nothing new is reached. As rays hardly find lamps that are small or seen at
+        a grazing angle, every patch draws PROBES lines to lamps as well.
         """
         n = self.count
         emits = np.array(dr.max(self.emission) > 0).astype(bool)
@@ -228,6 +229,11 @@ class Model:
             source = np.concatenate([source, more])
             number = owned(mi.UInt32, np.tile(np.arange(each), len(lamps)))
             target = np.concatenate([target, cast(owned(mi.UInt32, more), number)])
+            patch, line = index // PROBES, index % PROBES
+            lamp = dr.gather(mi.UInt32, owned(mi.UInt32, lamps), mi.sample_tea_32(index, 0, ROUNDS)[0] % dr.opaque(mi.UInt32, len(lamps)))
+            x0, x1, y0, y1 = kronecker(line, patch, dr.opaque(mi.UInt32, 1))
+            sees = np.array(self._connected(patch, *triangle(x0, x1), lamp, *triangle(y0, y1))).astype(bool)
+            source, target = np.concatenate([source, np.array(lamp)[sees]]), np.concatenate([target, np.array(patch)[sees]])
         source, target = source[target != NONE], target[target != NONE]
         reached, before = emits, 0
         while reached.sum() > before:
@@ -300,6 +306,13 @@ class Model:
         ray.maxt = 1 - 1e-5
         seen = faces & ~self.blocked(ray, faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
+
+
+    def _connected(self, i, ui, vi, j, uj, vj):
+        """Do points of patches see each other, each more than rounding above the plane of the other (Bool [n])?"""
+        d = self.point(j, uj, vj) - self.point(i, ui, vi)
+        above = (dr.dot(dr.gather(mi.Vector3f, self.normal, i), d) > self._lift) & (-dr.dot(dr.gather(mi.Vector3f, self.normal, j), d) > self._lift)
+        return above & (self.kernel(i, ui, vi, j, uj, vj) > 0)
 
 
 def owned(kind, array):

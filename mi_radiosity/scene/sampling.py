@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 _PHI = 1.1673039782614187
+ROUNDS = 8      # of the hash: with Mitsuba's 4, the numbers of neighbouring keys and seeds go together
 STEPS = tuple(round(_PHI ** -(d + 1) * 2 ** 32) for d in range(4))
 
 
@@ -18,7 +19,7 @@ def kronecker(index, key, seed):
 
     index, key: UInt32 [n]; seed: UInt32 (use an opaque literal). Returns 4 Float [n].
     """
-    shifts = (*mi.sample_tea_32(key, seed), *mi.sample_tea_32(key ^ 0x9E3779B9, seed))
+    shifts = (*mi.sample_tea_32(key, seed, ROUNDS), *mi.sample_tea_32(key ^ 0x9E3779B9, seed, ROUNDS))
     return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0 ** -24
                  for shift, step in zip(shifts, STEPS))
 

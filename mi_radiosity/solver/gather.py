@@ -3,7 +3,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import kronecker, triangle
+from ..scene.sampling import ROUNDS, kronecker, triangle
 from .arrays import lower_bound, opaque_index, totals
 from .power import WEIGHTS, pull
 
@@ -65,7 +65,7 @@ class Starved:
         cumulative = dr.cumsum(mi.UInt64(dr.ceil(power * dr.opaque(mi.Float64, WEIGHTS / whole))))
         dr.eval(cumulative)
         # Stratified over the lamps' power.
-        draw = (mi.Float64(line) + mi.sample_tea_float32(leaf ^ 0xA511E9B3, self.seed)) / mi.Float64(opaque_index(self.samples))
+        draw = (mi.Float64(line) + mi.sample_tea_float32(leaf ^ 0xA511E9B3, self.seed, ROUNDS)) / mi.Float64(opaque_index(self.samples))
         j = lower_bound(cumulative, mi.UInt64(draw * dr.opaque(mi.Float64, WEIGHTS)) + 1)
         E = dr.gather(mi.Color3f, emission, j)
         F = model.kernel(patch, u, v, dr.gather(mi.UInt32, lamps, j), *triangle(s, t))

@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import kronecker, triangle
+from ..scene.sampling import ROUNDS, kronecker, triangle
 from .arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
 
 TAIL = 0.01             # share of the power below which the rest is summed in closed form
@@ -120,7 +120,7 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
 
     ray = dr.arange(mi.UInt32, count)
     key = opaque_index(seed)
-    jitter = mi.sample_tea_float32(opaque_index(first), key ^ 0x5EED)
+    jitter = mi.sample_tea_float32(opaque_index(first), key ^ 0x5EED, ROUNDS)
     spacing = dr.opaque(mi.Float64, whole / count)
     k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
     x0, x1, d0, d1 = kronecker(ray, opaque_index(first), key)
