@@ -129,18 +129,19 @@ class _Topology:
         """Vertex values from leaf values: averages over the leaves around (Color3f [vertices]).
 
         A leaf counts by its angle at the vertex over its size, which is right for linear fields next
-        to a hanging vertex.
+        to a hanging vertex, and by the share of it that can be seen.
         """
         e = self.elements
         patch = dr.gather(mi.UInt32, e.patch, self.leaves)
         e1, e2 = dr.gather(mi.Vector3f, e.model.e1, patch), dr.gather(mi.Vector3f, e.model.e2, patch)
         sides = (e1, e2), (e2 - e1, -e1), (-e2, e1 - e2)
-        size = dr.sqrt(dr.gather(mi.Float, e.area, self.leaves))
+        area = dr.gather(mi.Float, e.area, self.leaves)
+        size, seen = dr.sqrt(area), dr.gather(mi.Float, e.open_area, self.leaves) / area
         bound = [2 * t for t in totals([mi.Float64(dr.abs(h)) / mi.Float64(size) * 16 for h in H])]
         sums, weights = ColorSums(self.count, bound), ColorSums(self.count, 3 * [20 * totals([1 / mi.Float64(size)])[0]])
         for k, (a, b) in enumerate(sides):
-            weight = dr.atan2(dr.norm(dr.cross(a, b)), dr.dot(a, b)) / size
-            for vertex, w in ((self.corner[k], weight), (self.middle[k], dr.pi / size)):
+            weight = dr.atan2(dr.norm(dr.cross(a, b)), dr.dot(a, b)) / size * seen
+            for vertex, w in ((self.corner[k], weight), (self.middle[k], dr.pi / size * seen)):
                 index = dr.gather(mi.UInt32, vertex, self.leaves)
                 sums.add([h * w for h in H], index, index != NONE)
                 weights.add([w, mi.Float(0), mi.Float(0)], index, index != NONE)

@@ -97,9 +97,9 @@ def _cold_seconds(path, elements, rays):
 def _recording_model(scene):
     """A Model that keeps the rays it casts."""
     class Recorder(Model):
-        def trace(self, origin, direction):
+        def trace(self, origin, direction, active=True):
             self.power_rays.append(mi.Ray3f(origin, direction))
-            return super().trace(origin, direction)
+            return super().trace(origin, direction, active)
 
         def blocked(self, ray, active):
             self.oracle_rays.append((mi.Ray3f(ray), active))

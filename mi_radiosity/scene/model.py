@@ -273,9 +273,9 @@ class Model:
         origin = self.point(patch, u, v) + self.origin + normal * self._lift
         return origin, cosine_direction(normal, s, t)
 
-    def trace(self, origin, direction):
+    def trace(self, origin, direction, active=True):
         """Nearest hits of rays (Point3f, Vector3f [rays])."""
-        prelim = self.tracing.ray_intersect_preliminary(mi.Ray3f(origin, direction))
+        prelim = self.tracing.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
         return self.locate(prelim, direction)
 
     def locate(self, prelim, direction):

@@ -14,8 +14,9 @@ class Elements:
     s = ±2^(−level), negative for the middle child of four, which stands upside down.
 
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
-    children, 0 for leaves; UInt32), ``u0``, ``v0``, ``scale`` (Float), ``area`` (Float, m²) and
-    ``reflectance`` (Color3f, the mean over the element).
+    children, 0 for leaves; UInt32), ``u0``, ``v0``, ``scale`` (Float), ``area`` and ``open_area``
+    (Float, m²; the second without what lies inside solids, see `find_covered`), ``reflectance``
+    (Color3f, the mean over the element).
     """
 
     def __init__(self, model):
@@ -26,7 +27,7 @@ class Elements:
         self.child = dr.zeros(mi.UInt32, n)
         self.u0, self.v0 = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.scale = dr.full(mi.Float, 1, n)
-        self.area = mi.Float(model.area)
+        self.area = self.open_area = mi.Float(model.area)
         self.reflectance = mi.Color3f(model.reflectance)
         self.leaves = n
 
@@ -59,7 +60,7 @@ class Elements:
         self.child = concat(self.child, dr.zeros(mi.UInt32, 4 * count))
         self.u0, self.v0 = concat(self.u0, u0), concat(self.v0, v0)
         self.scale = concat(self.scale, scale)
-        self.area = concat(self.area, dr.gather(mi.Float, self.area, parent) * .25)
+        self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * .25)
         self.reflectance = concat(self.reflectance, reflectance)
         self.leaves += 3 * count
         dr.eval(self.patch, self.parent, self.child, self.u0, self.v0, self.scale, self.area, self.reflectance)
@@ -88,6 +89,17 @@ class Elements:
             element = child + self.locate(element, u, v)
             child = dr.gather(mi.UInt32, self.child, element)
         return element
+
+    @dr.syntax
+    def add_to_ancestors(self, sums, leaves, power):
+        """Add values of leaves (three Float64) to themselves and to all their ancestors in ColorSums."""
+        element = mi.UInt32(leaves)
+        climbing = dr.full(mi.Bool, True, dr.width(leaves))
+        while climbing:
+            sums.add(power, element, climbing)
+            parent = dr.gather(mi.UInt32, self.parent, element)
+            climbing = parent != element
+            element = parent
 
     def patch_point(self, element, a, b):
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""

@@ -48,10 +48,11 @@ class Starved:
         indirect = self._from_room(patch, u, v, s, t, flow)
 
         leaves = e.leaf_indices()
-        area = mi.Float64(dr.gather(mi.Float, e.area, leaves))
+        area = mi.Float64(dr.gather(mi.Float, e.open_area, leaves))
+        whole = dr.gather(mi.Float, e.area, self.leaves) / dr.gather(mi.Float, e.open_area, self.leaves)
         for name, gathered in (("direct", direct), ("indirect", indirect)):
             field = mi.Color3f(getattr(flow, name))
-            mean = mi.Color3f(*(dr.block_sum(c, self.samples) / mi.Float(each) for c in gathered))
+            mean = mi.Color3f(*(dr.block_sum(c, self.samples) / mi.Float(each) for c in gathered)) * whole
             dr.scatter(field, mean, self.leaves)
             setattr(flow, name, pull(e, leaves, area, [mi.Float64(dr.gather(mi.Float, c, leaves)) for c in field]))
 

@@ -63,7 +63,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     """
     elements, model = pairs.elements, pairs.elements.model
     leaves = elements.leaf_indices()
-    area = mi.Float64(dr.gather(mi.Float, elements.area, leaves))
+    area = mi.Float64(dr.gather(mi.Float, elements.open_area, leaves))
     reflectance = dr.gather(mi.Color3f, elements.reflectance, leaves)
     emission = dr.gather(mi.Color3f, model.emission, dr.gather(mi.UInt32, elements.patch, leaves))
     power = [mi.Float64(e) * area for e in emission]                # unshot, per channel [leaves]
@@ -139,9 +139,12 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
         receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
     n = len(elements)
     bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
-    each = spacing / mi.Float64(dr.gather(mi.UInt64, weight, k))
-    sums = ColorSums(n + 2, [2 * u for u in unshot])
-    sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin)
+    # Rays that start inside a solid go nowhere; the others of their element carry their power.
+    share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
+    starts = (share >= 1) | on_patch | ~hit.valid
+    each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
+    sums = ColorSums(n + 2, [4 * u for u in unshot])
+    sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
     record = None
     if pilot:
         record = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
@@ -164,7 +167,7 @@ def _sum_ancestors(elements, sums, leaves):
     r, g, b = dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n)
     climbing = dr.full(mi.Bool, True, n)
     while climbing:
-        area = mi.Float64(dr.gather(mi.Float, elements.area, element))
+        area = mi.Float64(dr.gather(mi.Float, elements.open_area, element))
         x, y, z = sums.gather(element)
         r, g, b = r + x / area, g + y / area, b + z / area
         parent = dr.gather(mi.UInt32, elements.parent, element)
@@ -177,20 +180,8 @@ def pull(elements, leaves, area, irradiance):
     """Area averages of leaf irradiance for all elements (Color3f [elements])."""
     power = [h * area for h in irradiance]
     sums = ColorSums(len(elements), [2 * t for t in totals(power)])
-    _add_to_ancestors(elements, sums, leaves, power)
+    elements.add_to_ancestors(sums, leaves, power)
     every = dr.arange(mi.UInt32, len(elements))
-    result = mi.Color3f(*(mi.Float(p / mi.Float64(elements.area)) for p in sums.gather(every)))
+    result = mi.Color3f(*(mi.Float(p / mi.Float64(elements.open_area)) for p in sums.gather(every)))
     dr.eval(result)
     return result
-
-
-@dr.syntax
-def _add_to_ancestors(elements, sums, leaves, power):
-    """Add the power of leaves to themselves and to all their ancestors."""
-    element = mi.UInt32(leaves)
-    climbing = dr.full(mi.Bool, True, dr.width(leaves))
-    while climbing:
-        sums.add(power, element, climbing)
-        parent = dr.gather(mi.UInt32, elements.parent, element)
-        climbing = parent != element
-        element = parent

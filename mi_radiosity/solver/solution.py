@@ -13,7 +13,7 @@ from ..scene.model import owned
 from .elements import Elements
 
 FORMAT = 1
-TREE = ("patch", "parent", "child", "u0", "v0", "scale")
+TREE = ("patch", "parent", "child", "u0", "v0", "scale", "open_area")
 
 
 @dataclass

@@ -8,6 +8,7 @@ from ..errors import RadiosityError
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from .arrays import totals
+from .cover import find_covered
 from .elements import Elements
 from .gather import Starved
 from .pairs import Pairs
@@ -60,6 +61,7 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
     pairs = Pairs(tree, oracle, int(lines), seed & 0xFFFFFFFF)
     refinement = Refinement(pairs, elements, epsilon, seed & 0xFFFFFFFF, lambda done: report("refine", done, elements))
     refinement.run()
+    find_covered(tree, seed & 0xFFFFFFFF)
     seconds["refine"] = lap()
 
     rays = int(rays or RAYS_PER_ELEMENT * tree.leaves)
@@ -87,6 +89,6 @@ def _balance(tree, flow):
     """
     leaves = tree.leaf_indices()
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)
-    absorbed = (1 - dr.gather(mi.Color3f, tree.reflectance, leaves)) * irradiance * dr.gather(mi.Float, tree.area, leaves)
+    absorbed = (1 - dr.gather(mi.Color3f, tree.reflectance, leaves)) * irradiance * dr.gather(mi.Float, tree.open_area, leaves)
     return {"emitted": sum(flow.emitted), "absorbed": sum(totals([mi.Float64(a) for a in absorbed])) + sum(flow.blocked),
             "escaped": sum(flow.escaped), "unshot": sum(flow.unshot)}
