@@ -3,12 +3,12 @@ from ._llvm import choose_llvm as _choose_llvm
 
 _choose_llvm()      # before anything imports drjit
 
-import mitsuba as _mi                                                                           # noqa: E402
+import mitsuba as _mi
 
-from .display import register as _register                                                      # noqa: E402
-from .errors import RadiosityError                                                              # noqa: E402
-from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap  # noqa: E402
-from .solver import Solution, solve                                                             # noqa: E402
+from .display import register as _register
+from .errors import RadiosityError
+from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
+from .solver import Solution, solve
 
 __version__ = "0.1.0"
 __all__ = ["solve", "Solution", "Oracle", "Pair", "KernelSamples", "GMI", "KS", "MI", "Power", "Uniform",

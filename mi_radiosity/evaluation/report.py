@@ -2,6 +2,8 @@
 import base64
 import html
 import io
+import math
+import re
 import statistics
 from pathlib import Path
 
@@ -113,7 +115,7 @@ def _error_table(results, labels, question, views):
         for view in views:
             for name in METRICS:
                 mean, half = interval([r[name] for r in _select(results, question, label, view)])
-                text = f"{mean:.3f}" + (f" ± {half:.3f}" if half == half else "")
+                text = f"{mean:.3f}" + (f" ± {half:.3f}" if not math.isnan(half) else "")
                 cells.append(f"**{text}**" if best[view, name] == label else text)
         rows.append(cells)
     return _markdown(head, rows)
@@ -198,7 +200,6 @@ def _png(figure):
 
 def _page(results, labels, figure):
     """The whole report as one HTML file with its pictures inside."""
-    import re
     def strong(text): return re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", html.escape(text))
     parts = []
     for block in _tables(results, labels):

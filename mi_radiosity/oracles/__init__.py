@@ -1,10 +1,10 @@
 """Refinement criteria: statistics of one pair of elements ─► one number σ, one criterion per file."""
+from ..errors import RadiosityError
 from .base import KernelSamples, Oracle, Pair
 from .information import GMI, MI, information_gap
-from .smoothness import KS
 from .power import Power
+from .smoothness import KS
 from .uniform import Uniform
-from ..errors import RadiosityError
 
 ORACLES = {"ks": KS, "mi": MI, "gmi": GMI, "power": Power, "uniform": Uniform}
 

@@ -173,7 +173,6 @@ class Model:
 
     def _choose_sides(self):
         """Make patches of the sides that light can reach: model only what a scene needs."""
-        n = len(self.face_shape)
         sound = ~self.degenerate
         candidate = np.column_stack([sound, sound & self.two_sided]).ravel()    # [2 faces], front and back in turn
         sides = np.flatnonzero(candidate)

@@ -6,7 +6,6 @@ one element are stratified whatever their number, and so are the lines of one pa
 The shift s is a hash of a key, which makes the estimates unbiased over seeds and independent
 between keys, threads and array sizes.
 """
-import drjit as dr
 import mitsuba as mi
 
 _PHI = 1.1673039782614187
