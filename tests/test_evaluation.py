@@ -146,7 +146,7 @@ def test_compare_writes_everything_and_resumes(tmp_path, monkeypatch, capsys):
     assert {"view", "oracle", "alpha", "seed", "elements", "pairs", "rays", "oracle_rays", "seconds", "rmse_a", "rmse_p", "psnr_a", "psnr_p"} <= set(results["rows"][0])
     table, page = (tmp_path / "table.md").read_text(), (tmp_path / "report.html").read_text()
     assert "RMSE_a (view 0)" in table and "**" in table
-    assert page.index("wins") < page.index("<img") and "data:image/png;base64" in page and (tmp_path / "figure.png").exists()
+    assert page.index("Its RMSE_a is") < page.index("<img") and "data:image/png;base64" in page and (tmp_path / "figure.png").exists()
     same_rays = {r["oracle"]: r["rays"] + r["oracle_rays"] + r["pilot_rays"] for r in results["rows"] if r["question"] == "rays"}
     assert same_rays["ks"] == pytest.approx(same_rays["gmi"], rel=0.02)
 

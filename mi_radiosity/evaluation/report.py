@@ -56,22 +56,29 @@ def _present(results, labels, question):
 
 def verdicts(results, labels):
     """One paragraph per question: who wins, by how much, at what cost, and whether that is decided."""
-    lines = []
-    for question in ("mesh", "rays", "time"):
-        present = _present(results, labels, question)
-        if len(present) < 2:
-            continue
-        views = results["setting"]["views"]
-        def mean(label, name, view=None): return statistics.mean(r[name] for r in _select(results, question, label, view))
-        ranked = sorted(present, key=lambda label: mean(label, "rmse_a_clean"))
-        best, second, last = ranked[0], ranked[1], ranked[-1]
-        def ratios(other): return " and ".join(f"{mean(best, 'rmse_a_clean', v) / mean(other, 'rmse_a_clean', v):.2f}" for v in views)
-        undecided = [other for other in ranked[1:] if not all(_decided(results, question, best, other, v) for v in views)]
-        more = mean(best, "oracle_rays") / max(mean(last, "oracle_rays"), 1)
-        lines.append(f"**{QUESTIONS[question][0].upper()}{QUESTIONS[question][1:]}:** {best} wins. Its RMSE_a is {ratios(second)} of {second}'s and {ratios(last)} of {last}'s "
-                     f"(by view, the reference's noise removed), with {more:.1f} times the oracle rays and {mean(best, 'seconds') / mean(last, 'seconds'):.2f} times the seconds of {last}. "
-                     + (f"Undecided: against {', '.join(undecided)} the intervals or the reference's noise leave it open." if undecided else "All differences are decided."))
-    return lines
+    questions = [q for q in ("mesh", "rays", "time") if len(_present(results, labels, q)) > 1]
+    return [_verdict(results, question, _present(results, labels, question)) for question in questions]
+
+
+def _verdict(results, question, labels):
+    views = results["setting"]["views"]
+
+    def mean(label, name, view=None):
+        return statistics.mean(r[name] for r in _select(results, question, label, view))
+
+    def ratios(label, other):
+        return " and ".join(f"{mean(label, 'rmse_a_clean', v) / mean(other, 'rmse_a_clean', v):.2f}" for v in views)
+
+    ranked = sorted(labels, key=lambda label: mean(label, "rmse_a_clean"))
+    best, second = ranked[:2]
+    base = "ks" if "ks" in ranked[1:] else ranked[-1]
+    undecided = [other for other in ranked[1:] if not all(_decided(results, question, best, other, v) for v in views)]
+    others = [base] if base == second else [base, second]
+    text = " and ".join(f"{ratios(best, other)} of {other}'s" for other in others)
+    return (f"**Given {QUESTIONS[question]}:** {best} {'leads' if second in undecided else 'wins'}. Its RMSE_a is {text} "
+            f"({'by view, ' if len(views) > 1 else ''}the reference's noise removed), for {mean(best, 'oracle_rays') / max(mean(base, 'oracle_rays'), 1):.1f} times the oracle rays "
+            f"and {mean(best, 'seconds') / mean(base, 'seconds'):.2f} times the seconds of {base}. "
+            + (f"Undecided, by the intervals or the reference's noise: {', '.join(undecided)}." if undecided else "All differences from it are decided."))
 
 
 def _decided(results, question, a, b, view):
@@ -95,7 +102,7 @@ def _tables(results, labels):
         present = _present(results, labels, question)
         if not present:
             continue
-        yield f"## For {QUESTIONS[question]}\n\n" + _error_table(results, present, question, views)
+        yield f"## Given {QUESTIONS[question]}\n\n" + _error_table(results, present, question, views)
         yield _cost_table(results, present, question)
     present = _present(results, labels, "noise")
     if present:
