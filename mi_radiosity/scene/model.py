@@ -8,6 +8,7 @@ import numpy as np
 
 from .. import _llvm
 from ..errors import RadiosityError
+from .overlap import Overlaps
 from .sampling import ROUNDS, cosine_direction, kronecker, triangle
 from .support import is_textured, label, require_supported
 from .tessellate import disk_mesh
@@ -64,6 +65,7 @@ class Model:
         self.tracing = self._tracing_scene(scene)
         self._read_faces(shapes)
         self._read_materials(shapes)
+        self._find_overlaps()
         self._choose_sides()
         self.fingerprint = self._fingerprint()
 
@@ -102,8 +104,7 @@ class Model:
         self.degenerate = double_area <= FLATNESS * longest
         if self.degenerate.any():
             names = sorted({label(shapes[i], i) for i in self.face_shape[self.degenerate]})
-            self.warnings.append(f"{int(self.degenerate.sum())} faces without area are left out, in {', '.join(names[:3])}"
-                                 + (f" and {len(names) - 3} more" if len(names) > 3 else ""))
+            self.warnings.append(f"{int(self.degenerate.sum())} faces without area are left out, in {_some(names)}")
         self._e1, self._e2 = e1, e2
         self._area = double_area / 2
         self._normal = cross / np.where(self.degenerate, 1, double_area)[:, None]
@@ -169,17 +170,38 @@ class Model:
         if not (self._exitance * self._area[:, None]).any():
             raise RadiosityError("the scene has no light: give at least one shape an 'area' emitter")
 
+    def _find_overlaps(self):
+        """Faces in one another: one of them is lit and shown wherever several are."""
+        sound = ~self.degenerate
+        front = self._normal * np.where(self._flipped, -1.0, 1.0)[:, None]
+        self._candidate = np.column_stack([sound, sound & self.two_sided])      # [faces, front and back]
+        exitance = self._exitance.sum(axis=1)
+        self.overlaps = Overlaps(self.corners, front, self._area, sound, self._rank, self._candidate, np.column_stack([exitance, 0 * exitance]),
+                                 self._rho.sum(axis=2).T, self.offset)
+        self._candidate &= ~self.overlaps.covered
+        if self.overlaps:
+            self.overlaps.prepare(owned, self.centre)
+
+    def _settle_overlaps(self):
+        """Keep what patches need of the overlaps, and tell the user what was decided."""
+        if not self.overlaps:
+            return
+        faces = self.overlaps.keep(2 * self._faces + self.sides % 2)
+        self.overlaps.prepare(owned, self.centre)
+        if len(faces):
+            names = sorted({label(self.scene.shapes()[i], i) for i in self.face_shape[faces]})
+            self.warnings.append(f"{len(faces)} faces lie in others, in {_some(names)}: where they do, a lamp or else the smaller surface is taken to be on top")
+
     # ---- Patches -------------------------------------------------------------------------------
 
     def _choose_sides(self):
         """Make patches of the sides that light can reach: model only what a scene needs."""
-        sound = ~self.degenerate
-        candidate = np.column_stack([sound, sound & self.two_sided]).ravel()    # [2 faces], front and back in turn
-        sides = np.flatnonzero(candidate)
+        sides = np.flatnonzero(self._candidate)         # front and back in turn
         self.use_sides(np.sort(2 * self._rank[sides // 2] + sides % 2))
         reached = self._reached()
         self.use_sides(self.sides[reached])
         self.unreached = int((~reached).sum())
+        self._settle_overlaps()
 
     def use_sides(self, sides):
         """Patches are the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
@@ -282,8 +304,11 @@ class Model:
         valid = prelim.is_valid()
         face = dr.gather(mi.UInt32, self.first_face, prelim.shape_index, valid) + prelim.prim_index
         back = dr.dot(dr.gather(mi.Vector3f, self._front, face, valid), direction) > 0
+        u, v = prelim.prim_uv.x, prelim.prim_uv.y
+        if self.overlaps:
+            face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
         patch = dr.gather(mi.UInt32, self._side_patch, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        return Hit(valid, dr.select(valid, patch, NONE), prelim.prim_uv.x, prelim.prim_uv.y)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v)
 
     def blocked(self, ray, active):
         """Does anything lie on the segments ``ray`` (Bool [n])?"""
@@ -325,6 +350,11 @@ def owned(kind, array):
         dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))
         dr.eval(copy)
     return copy
+
+
+def _some(names):
+    """Up to three names, and how many more there are."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _canonical_rank(corners):

@@ -18,7 +18,8 @@ class Pairs:
     Roots are pairs of patches that a ray connects, found by binary search over sorted keys i·2³² + j.
     A pair whose larger element is split has four children. Arrays over pairs: ``receiver``,
     ``source``, ``child`` (first of four, 0 for none; UInt32), ``sigma`` (Float, UNKNOWN before the
-    one evaluation a pair ever gets).
+    one evaluation a pair ever gets), ``partial`` (Bool: a line between the two was blocked, or below
+    a horizon, so that light does not spread over all of the receiver).
     """
 
     def __init__(self, elements, oracle, lines, seed):
@@ -28,7 +29,7 @@ class Pairs:
         self.roots = mi.UInt32(NONE)
         # Pair 0 is never used, so that child == 0 means none.
         self.receiver, self.source, self.child = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-        self.sigma = mi.Float(0)
+        self.sigma, self.partial = mi.Float(0), mi.Bool(False)
         self.evaluated = 0
 
     def __len__(self):
@@ -40,6 +41,7 @@ class Pairs:
         n = dr.width(receiver)
         self.child = concat(self.child, dr.zeros(mi.UInt32, n))
         self.sigma = concat(self.sigma, dr.full(mi.Float, UNKNOWN, n))
+        self.partial = concat(self.partial, dr.zeros(mi.Bool, n))
 
     # ---- Finding pairs -------------------------------------------------------------------------
 
@@ -96,11 +98,12 @@ class Pairs:
             values = self.kernel_samples(pairs)
             dr.eval(values)
             samples = KernelSamples(values, self.lines)
+            dr.scatter(self.partial, samples.min() <= 0, pairs)
         receiver, source = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
         pair = Pair(mi.Float64(dr.gather(mi.Float, e.area, receiver)), mi.Float64(dr.gather(mi.Float, e.area, source)), e.model.total_area)
         sigma = self.oracle.sigma(samples, pair)
         dr.scatter(self.sigma, dr.maximum(mi.Float(sigma), 0), pairs)
-        dr.eval(self.sigma)
+        dr.eval(self.sigma, self.partial)
 
     def kernel_samples(self, pairs):
         """F along S lines of each pair, stratified in all four dimensions (Float [pairs · lines])."""
@@ -137,4 +140,4 @@ class Pairs:
         receiver, source = dr.gather(mi.UInt32, self.receiver, parent), dr.gather(mi.UInt32, self.source, parent)
         of_receiver = receiver == split
         self._append(dr.select(of_receiver, half, receiver), dr.select(of_receiver, source, half))
-        dr.eval(self.receiver, self.source, self.child, self.sigma)
+        dr.eval(self.receiver, self.source, self.child, self.sigma, self.partial)

@@ -50,7 +50,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     the power ρ H_(k−1) A that is unshot, with rays in proportion to it: systematic over the
     elements, cosine-distributed, low-discrepancy in position and direction. A ray leaves its power
     at the receiver of the first pair without children on its way down; where nobody has evaluated
-    that pair, at the leaf it meets.
+    that pair, or something stands between the two, at the leaf it meets: no light behind walls.
 
     The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration,
     every later one takes 1 − λ of the rays left, so that all rays carry about the same power. Once
@@ -135,7 +135,7 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
     pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
     receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
     if not pilot:
-        vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0)
+        vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0) & ~dr.gather(mi.Bool, pairs.partial, pair, known)
         receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
     n = len(elements)
     bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))

@@ -24,14 +24,15 @@ class Refinement:
     stopped at, and splits the worst. Pilot rays discover pairs and estimate the radiosity the
     oracle weighs them with; none of them carries power into the solution.
 
-    elements: leaves wanted, or None; epsilon: ε, or None; just one of them is given.
+    elements: leaves wanted, or None; epsilon: ε, or None; just one of them is given. A mesh the
+    oracle finds too little to refine in is an error if ``exact``.
     Afterwards ``epsilon`` is the ε reached, ``rays`` the pilot rays cast, ``first_share`` what
     `distribute` wants to know.
     """
 
-    def __init__(self, pairs, elements, epsilon, seed, progress=lambda done: None):
+    def __init__(self, pairs, elements, epsilon, seed, progress=lambda done: None, exact=True):
         self.pairs, self.elements, self.oracle = pairs, pairs.elements, pairs.oracle
-        self.wanted, self.floor = elements, epsilon
+        self.wanted, self.floor, self.exact = elements, epsilon, exact
         self.seed, self.progress = seed, progress
         self.epsilon = epsilon or 0.0
         self.rays, self.pilots, self.first_share = 0, 0, 0.5
@@ -53,7 +54,7 @@ class Refinement:
             if self.elements.leaves >= RENEW * renewed and self._room():
                 self._pilot()
                 renewed = self.elements.leaves
-        if self.wanted is not None and self._room():
+        if self.wanted is not None and self._room() and self.exact:
             raise RadiosityError(f"the oracle '{self.oracle}' finds nothing left to refine at {self.elements.leaves} elements: "
                                  f"ask for fewer than {self.wanted} --elements, or give --epsilon instead")
 

@@ -25,9 +25,10 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more than the scene has patches, or twice the patches. rays: rays that carry the
-    power, used exactly; 300 per element by default. lines: random lines S per pair for the oracle. seed: any
-    integer; the same seed gives the same solution. progress: called with (stage, done, total), stage
+    either, 19,000 more than the scene has patches, or twice the patches, unless the oracle finds less
+    to refine. rays: rays that carry the power, used exactly; 300 per element by default. lines: random
+    lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
+    progress: called with (stage, done, total), stage
     being "refine" or "distribute" (total is None where it is not known).
 
     Returns a Solution. Raises RadiosityError for options and scenes that cannot be used.
@@ -51,6 +52,7 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
         return clock[-1] - clock[-2]
 
     model = scene if isinstance(scene, Model) else Model(scene)
+    exact = elements is not None
     if epsilon is None and elements is None:
         elements = model.count + max(ELEMENTS, model.count)
     if elements is not None and elements < model.count:
@@ -59,7 +61,7 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
 
     tree = Elements(model)
     pairs = Pairs(tree, oracle, int(lines), seed & 0xFFFFFFFF)
-    refinement = Refinement(pairs, elements, epsilon, seed & 0xFFFFFFFF, lambda done: report("refine", done, elements))
+    refinement = Refinement(pairs, elements, epsilon, seed & 0xFFFFFFFF, lambda done: report("refine", done, elements), exact)
     refinement.run()
     find_covered(tree, seed & 0xFFFFFFFF)
     seconds["refine"] = lap()

@@ -1,0 +1,193 @@
+"""Faces that lie in one another: which of them a ray meets is decided here, not by rounding."""
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+CHUNK = 1 << 21         # candidate pairs tested at a time: bounds memory
+EDGE = 1e-5             # how far outside of a face, in barycentric coordinates, a point still counts as on it
+LATTICE = 8             # points along a side that show whether a face is covered
+
+
+class Overlaps:
+    """Coplanar faces that share area, and who owns what they share.
+
+    Where faces lie in one plane to within ``tolerance``, rounding decides which of them a ray
+    meets, so each would get a part of the light and pictures would be speckled. A point belongs to
+    one side instead: to one with a material before one without, to a lamp, then to the smaller
+    surface, which is read as lying on the larger. Surfaces are faces that share edges in a plane.
+
+    corners [faces, 3, 3], unit normals towards the front [faces, 3], areas [faces]; per side, front
+    and back, ``present`` (bool [faces, 2]) and ``exitance`` [faces, 2], ``reflectance`` [faces, 2].
+    Numbers of sides are 2 · face + (1 for the back).
+
+    ``covered`` (bool [faces, 2]): sides no point of which is their own.
+    """
+
+    def __init__(self, corners, normal, area, sound, rank, present, exitance, reflectance, tolerance):
+        self.corners, self.tolerance = corners, tolerance
+        self.covered, self._present = np.zeros(present.shape, dtype=bool), present.ravel().copy()
+        f, g = self._pairs(normal, sound)
+        self._side = self._other = np.zeros(0, dtype=np.int64)
+        if not len(f):
+            return
+        surface, order = _surfaces(corners, normal), np.empty(present.size, dtype=np.int64)
+        size = np.bincount(surface, weights=np.where(sound, area, 0))[surface]
+        first = np.full(surface.max() + 1, len(area))
+        np.minimum.at(first, surface, rank)
+        keys = (rank[:, None], first[surface][:, None], reflectance, np.round(np.log(size + 1e-300), 4)[:, None], -exitance, ~present)
+        order[np.lexsort([np.broadcast_to(k, present.shape).ravel() for k in keys])] = np.arange(present.size)
+
+        # ---- For every side, the sides before it, best first ----
+        opposite = (normal[f] * normal[g]).sum(axis=1) < 0
+        side, other = (np.concatenate([2 * f, 2 * f + 1]), np.concatenate([2 * g + opposite, 2 * g + 1 - opposite]))
+        before = (order[other] < order[side]) & present.ravel()[other]
+        by = np.lexsort([order[other[before]], side[before]])
+        self._side, self._other = side[before][by], other[before][by]
+        self._find_covered()
+
+    def __bool__(self):
+        return bool(len(self._side))
+
+    def _pairs(self, normal, sound):
+        """Ordered pairs (f, g) of coplanar faces whose interiors meet (two int [pairs])."""
+        low, high = self.corners.min(axis=1), self.corners.max(axis=1)
+        found = [np.zeros((0, 2), dtype=np.int64)]
+        for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), self.tolerance):
+            # f is not much smaller than g: it defines the plane.
+            x = self.corners[g] - self.corners[f, :1]
+            near = np.abs((x * normal[f, None]).sum(axis=2)).max(axis=1) <= self.tolerance
+            f, g = f[near], g[near]
+            axis = np.abs(normal[f]).argmax(axis=1)
+            flat = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
+            meet = _triangles_meet(*(np.take_along_axis(self.corners[k], np.broadcast_to(flat, (len(k), 3, 2)), axis=2) for k in (f, g)), self.tolerance)
+            found.append(np.column_stack([f[meet], g[meet]]))
+        pairs = np.concatenate(found)
+        return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+
+    def _find_covered(self):
+        """Which sides belong to others everywhere, judged by a lattice of points."""
+        a, b = (x.ravel() for x in np.indices((LATTICE, LATTICE)))
+        a, b = a[a + b < LATTICE], b[a + b < LATTICE]
+        u, v = (a[:, None] + 1 / 3) / LATTICE, (b[:, None] + 1 / 3) / LATTICE
+        sides, row = np.unique(self._side, return_inverse=True)
+        taken = np.zeros((len(sides), len(u)), dtype=bool)
+        for start in range(0, len(row), CHUNK >> 6):
+            part = slice(start, start + (CHUNK >> 6))
+            corner = self.corners[self._side[part] // 2][:, :, None]
+            points = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
+            np.logical_or.at(taken, row[part], _inside(points, self.corners[self._other[part] // 2]))
+        self.covered.reshape(-1)[sides] = taken.all(axis=1)
+
+    def keep(self, patches):
+        """Forget what hides behind sides that are no ``patches`` (int); returns the faces that really lie in one another."""
+        there = np.zeros(self.covered.size, dtype=bool)
+        there[patches] = True
+        kept = there[self._other]
+        self._side, self._other = self._side[kept], self._other[kept]
+        doubled = self._present[self._side] & (there | self.covered.ravel())[self._side]
+        return np.unique(np.concatenate([self._side[doubled], self._other[doubled]]) // 2)
+
+    def prepare(self, owned, centre):
+        """Tables for ``owner``, on the device."""
+        corner = self.corners - centre
+        def vector(kind, a): return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
+        self._tables = [vector(mi.Point3f, corner[:, 0])] + [vector(mi.Vector3f, corner[:, k] - corner[:, 0]) for k in (1, 2)]
+        self._starts = owned(mi.UInt32, np.searchsorted(self._side, np.arange(self.covered.size + 1)))
+        self._others = owned(mi.UInt32, self._other)
+
+    @dr.syntax
+    def owner(self, face, back, u, v, active):
+        """The face, side and coordinates that points (u, v) of sides belong to (UInt32, Bool, Float, Float)."""
+        side = 2 * face + dr.select(back, mi.UInt32(1), mi.UInt32(0))
+        p0, e1, e2 = (dr.gather(type(t), t, face, active) for t in self._tables)
+        x = p0 + e1 * u + e2 * v
+        at = dr.gather(mi.UInt32, self._starts, side, active)
+        end = dr.gather(mi.UInt32, self._starts, side + 1, active)
+        u, v = mi.Float(u), mi.Float(v)
+        while active & (at < end):
+            other = dr.gather(mi.UInt32, self._others, at)
+            q0, q1, q2 = dr.gather(mi.Point3f, self._tables[0], other >> 1), dr.gather(mi.Vector3f, self._tables[1], other >> 1), dr.gather(mi.Vector3f, self._tables[2], other >> 1)
+            normal = dr.cross(q1, q2)
+            n2 = dr.squared_norm(normal)
+            a, b = dr.dot(dr.cross(x - q0, q2), normal) / n2, dr.dot(dr.cross(q1, x - q0), normal) / n2
+            inside = (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)
+            side = dr.select(inside, other, side)
+            u = dr.select(inside, dr.clip(a, 0, 1), u)
+            v = dr.select(inside, dr.clip(b, 0, 1), v)
+            at = dr.select(inside, end, at + 1)
+        return side >> 1, (side & 1) == 1, u, v
+
+
+def _boxes_that_meet(low, high, faces, tolerance):
+    """Yield pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge; the first is of the size of the second at least."""
+    low, high = low - low.min(axis=0) - tolerance, high - low.min(axis=0) + tolerance
+    level = np.frexp((high - low).max(axis=1))[1]
+    for size in np.unique(level[faces]):
+        # Faces no larger than a cell are in eight cells at most.
+        small = faces[level[faces] <= size]
+        ends = np.floor(np.stack([low[small], high[small]]) / 2.0 ** size).astype(np.int64)
+        wide = ends[0] != ends[1]
+        keys, there = [], []
+        for corner in np.ndindex(2, 2, 2):
+            new = (wide | (np.array(corner) == 0)).all(axis=1)
+            x, y, z = (ends[corner[k], new, k] for k in range(3))
+            keys.append(x * 0x9E3779B97F4A7C1 + y * 0x2545F4914F6CDD1D + z * 0x27D4EB2F165667C5)    # two cells of one key only cost time
+            there.append(small[new])
+        keys, there = np.concatenate(keys), np.concatenate(there)
+        largest = np.flatnonzero(level[there] == size)
+        largest = largest[np.argsort(keys[largest])]
+        start = np.searchsorted(keys[largest], keys)
+        count = np.searchsorted(keys[largest], keys, side="right") - start
+        for part in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // CHUNK)) + 1):
+            each = count[part]
+            g = np.repeat(there[part], each)
+            f = there[largest[np.repeat(start[part], each) + np.arange(len(g)) - np.repeat(np.cumsum(each) - each, each)]]
+            near = (f < g) | (level[g] < size)
+            f, g = f[near], g[near]
+            shared = np.minimum(high[f], high[g]) - np.maximum(low[f], low[g]) - 2 * tolerance
+            near = (shared > -tolerance).all(axis=1) & ((shared > tolerance / 2).sum(axis=1) > 1)
+            yield f[near], g[near]
+
+
+def _surfaces(corners, normal):
+    """A number per face, the same for faces joined by edges, within one plane, that they run along in opposite directions (int [faces])."""
+    n = len(corners)
+    _, vertex = np.unique(np.round(corners.reshape(-1, 3), 12), axis=0, return_inverse=True)
+    vertex = vertex.reshape(n, 3).astype(np.int64)
+    tail, head, face = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel(), np.repeat(np.arange(n), 3)
+    along, against = tail << 32 | head, head << 32 | tail
+    order = np.argsort(along, kind="stable")
+    at = np.minimum(np.searchsorted(along[order], against), 3 * n - 1)
+    joined = along[order][at] == against
+    f, g = face[joined], face[order[at[joined]]]
+    level = (normal[f] * normal[g]).sum(axis=1) > 1 - 1e-6
+    f, g = f[level], g[level]
+    label, before = np.arange(n), None
+    while before is None or (label != before).any():
+        before = label.copy()
+        np.minimum.at(label, f, label[g])
+        np.minimum.at(label, g, label[f])
+        label = label[label]
+    return label
+
+
+def _triangles_meet(p, q, tolerance):
+    """Do interiors of triangles p and q [n, 3, 2] share more than ``tolerance`` (bool [n])? By separating lines."""
+    meet = np.ones(len(p), dtype=bool)
+    for t in (p, q):
+        for k in range(3):
+            edge = t[:, (k + 1) % 3] - t[:, k]
+            length = np.maximum(np.hypot(*edge.T), np.finfo(float).tiny)
+            across = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
+            a, b = ((x * across[:, None]).sum(axis=2) for x in (p, q))
+            meet &= (a.min(axis=1) < b.max(axis=1) - tolerance) & (b.min(axis=1) < a.max(axis=1) - tolerance)
+    return meet
+
+
+def _inside(points, triangles):
+    """Do ``points`` [n, m, 3] lie in the triangles [n, 3, 3] of their planes (bool [n, m])?"""
+    e1, e2 = (triangles[:, k, None] - triangles[:, :1] for k in (1, 2))
+    x, normal = points - triangles[:, :1], np.cross(e1, e2)
+    n2 = (normal ** 2).sum(axis=2)
+    a, b = (np.cross(x, e2) * normal).sum(axis=2) / n2, (np.cross(e1, x) * normal).sum(axis=2) / n2
+    return (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)
