@@ -5,7 +5,7 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import RadiosityError
+from .errors import RadiosityError, interruptible
 from .files import check_writable, writing
 
 PROGRAM = "mi-radiosity"
@@ -21,7 +21,8 @@ def main(argv=None):
     """Run one command; returns the exit status: 0, 2 for what the user can mend, 130 after Ctrl-C."""
     try:
         arguments = _parser().parse_args(argv)
-        return arguments.command(arguments) or 0
+        with interruptible():
+            return arguments.command(arguments) or 0
     except RadiosityError as error:
         print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

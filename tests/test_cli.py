@@ -99,3 +99,13 @@ def test_interrupt(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("mi_radiosity.solver.solve", stop)
     assert main(["render", BOX, "-o", str(tmp_path / "x.png")]) == 130
     assert list(tmp_path.iterdir()) == [] and "interrupted" in capsys.readouterr().err
+
+
+def test_interrupt_inside_a_loop_of_drjit(tmp_path, monkeypatch):
+    """Dr.Jit wraps the interrupt in a RuntimeError; it still is one."""
+    from mi_radiosity.solver import elements
+
+    def stop(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(elements, "child_at", stop)
+    assert main(["render", BOX, "-o", str(tmp_path / "x.png"), *QUICK]) == 130

@@ -4,7 +4,7 @@ import time
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import RadiosityError
+from ..errors import RadiosityError, interruptible
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from .arrays import totals
@@ -20,6 +20,7 @@ ELEMENTS = 19_000           # default mesh: so many leaves more than patches, or
 RAYS_PER_ELEMENT = 300      # default ray budget
 
 
+@interruptible()
 def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=10, seed=0, progress=None):
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
 
