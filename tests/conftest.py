@@ -1,4 +1,5 @@
-import mi_radiosity  # noqa: F401  chooses LLVM before drjit loads
+import mi_radiosity  # chooses LLVM before drjit loads
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -7,15 +8,18 @@ mi.set_variant("llvm_ad_rgb")
 mi.set_log_level(mi.LogLevel.Error)
 
 
+ORACLES = [mi_radiosity.KS(), mi_radiosity.MI(), mi_radiosity.GMI(0.5), mi_radiosity.GMI(1.5), mi_radiosity.Power(), mi_radiosity.Uniform()]
+
+
 @pytest.fixture(scope="session")
 def cornell():
     return mi.load_dict(mi.cornell_box())
 
 
-def scene(**shapes):
-    """A scene of shapes given as dictionaries, with a small camera."""
+def scene(optimize=True, **shapes):
+    """A scene of shapes given as dictionaries, with a small camera; ``optimize`` merges those that share a BSDF."""
     camera = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}
-    return mi.load_dict({"type": "scene", "camera": camera, **shapes})
+    return mi.load_dict({"type": "scene", "camera": camera, **shapes}, optimize=optimize)
 
 
 def diffuse(reflectance=0.5, two_sided=False):
@@ -35,7 +39,8 @@ def rectangle(to_world=None, **parts):
 def leaf_values(solution, name="radiosity"):
     """(values [leaves, 3], areas [leaves], patches [leaves]) of a solution's leaves as NumPy arrays."""
     leaves = np.flatnonzero(np.array(solution.elements.child) == 0)
-    values = np.array(getattr(solution, name)()).reshape(3, -1).T[leaves]
+    values = getattr(solution, name)
+    values = np.array(values() if callable(values) else values).reshape(3, -1).T[leaves]
     return values, np.array(solution.elements.area)[leaves], np.array(solution.elements.patch)[leaves]
 
 
@@ -77,3 +82,38 @@ def icosphere(subdivisions, inwards=True):
 def group(model, reflectance):
     """Numbers of the patches with a reflectance (UInt32 NumPy array): how tests tell surfaces apart."""
     return np.flatnonzero(np.isclose(np.array(model.reflectance)[0], reflectance, atol=1e-6)).astype(np.uint32)
+
+
+def balance(solution):
+    """Power accounted for over power emitted; 1 if none is lost."""
+    power = solution.stats["power"]
+    return (power["absorbed"] + power["escaped"] + power["unshot"]) / power["emitted"]
+
+
+def leaf_corners(solution):
+    """Corners of the leaves in the coordinates of the scene [leaves, 3, 3]."""
+    e, model = solution.elements, solution.model
+    leaf = mi.UInt32(np.flatnonzero(np.array(e.child) == 0).astype(np.uint32))
+    patch = dr.gather(mi.UInt32, e.patch, leaf)
+    corners = [np.array(model.point(patch, *e.patch_point(leaf, mi.Float(a), mi.Float(b)))).T for a, b in ((0, 0), (1, 0), (0, 1))]
+    return np.stack(corners, axis=1) + model.centre
+
+
+def border_values(solution):
+    """Field values on the borders of all leaves at dyadic points: positions [n, 3], normals, values [n, 3]."""
+    e, model = solution.elements, solution.model
+    leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
+    level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
+    finest = min(level.max(), 9)
+    steps = 2 ** np.maximum(finest - level, 0)
+    leaf = np.repeat(leaves, 3 * steps)
+    start = np.repeat(np.cumsum(3 * steps) - 3 * steps, 3 * steps)
+    number, step = np.arange(len(leaf)) - start, np.repeat(steps, 3 * steps)
+    side, t = number // step, (number % step) / step
+    a = np.choose(side, [t, 1 - t, 0 * t]).astype(np.float32)
+    b = np.choose(side, [0 * t, t, 1 - t]).astype(np.float32)
+    index = mi.UInt32(leaf)
+    u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
+    patch = dr.gather(mi.UInt32, e.patch, index)
+    values = np.array(mi_radiosity.display.Field(solution).at(index, u, v)).T
+    return np.array(model.point(patch, u, v)).T, np.array(dr.gather(mi.Vector3f, model.normal, patch)).T, values

@@ -3,7 +3,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import diffuse, lamp, rectangle, scene
+from conftest import border_values, diffuse, lamp, rectangle, scene
 
 import mi_radiosity as mr
 from mi_radiosity.display import Field
@@ -12,26 +12,6 @@ from mi_radiosity.display import Field
 @pytest.fixture(scope="module")
 def solution(cornell):
     return mr.solve(cornell, elements=3000, rays=200_000)
-
-
-def border_values(solution):
-    """Field values on the borders of all leaves at dyadic points: positions [n, 3], normals, values [n, 3]."""
-    e, model = solution.elements, solution.model
-    leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
-    level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
-    finest = min(level.max(), 9)
-    steps = 2 ** np.maximum(finest - level, 0)
-    leaf = np.repeat(leaves, 3 * steps)
-    start = np.repeat(np.cumsum(3 * steps) - 3 * steps, 3 * steps)
-    number, step = np.arange(len(leaf)) - start, np.repeat(steps, 3 * steps)
-    side, t = number // step, (number % step) / step
-    a = np.choose(side, [t, 1 - t, 0 * t]).astype(np.float32)
-    b = np.choose(side, [0 * t, t, 1 - t]).astype(np.float32)
-    index = mi.UInt32(leaf)
-    u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
-    patch = dr.gather(mi.UInt32, e.patch, index)
-    values = np.array(Field(solution).at(index, u, v)).T
-    return np.array(model.point(patch, u, v)).T, np.array(dr.gather(mi.Vector3f, model.normal, patch)).T, values
 
 
 def test_the_field_is_continuous(solution):

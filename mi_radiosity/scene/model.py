@@ -365,7 +365,9 @@ def _canonical_rank(corners):
     """
     centroid = corners.mean(axis=1)
     low = centroid.min(axis=0)
-    cell = ((centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (2 ** 20 - 1)).astype(np.uint64)
+    # Off the borders of cells, where halves and thirds lie: rounding must not decide there.
+    place = (centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (3 ** .5 - 1) + 1 - 3 ** .5 / 2
+    cell = (place * (2 ** 20 - 1)).astype(np.uint64)
     morton = np.zeros(len(corners), dtype=np.uint64)
     for bit in range(20):
         for axis in range(3):

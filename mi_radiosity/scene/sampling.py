@@ -23,6 +23,11 @@ def kronecker(index, key, seed):
                  for shift, step in zip(shifts, STEPS))
 
 
+def hash_pair(a, b):
+    """One well mixed number from two (UInt32 [n])."""
+    return mi.sample_tea_32(a, b, ROUNDS)[0]
+
+
 def triangle(u, v):
     """Uniform barycentric coordinates (Float u, Float v) of a triangle from two uniform numbers."""
     point = mi.warp.square_to_uniform_triangle(mi.Point2f(u, v))

@@ -2,6 +2,7 @@
 import drjit as dr
 import mitsuba as mi
 
+from ..scene.sampling import hash_pair
 from .arrays import concat, opaque_index
 
 MAX_LEVEL = 14      # below it float32 barycentric coordinates get too coarse
@@ -14,9 +15,10 @@ class Elements:
     s = ±2^(−level), negative for the middle child of four, which stands upside down.
 
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
-    children, 0 for leaves; UInt32), ``u0``, ``v0``, ``scale`` (Float), ``area`` and ``open_area``
-    (Float, m²; the second without what lies inside solids, see `find_covered`), ``reflectance``
-    (Color3f, the mean over the element).
+    children, 0 for leaves; UInt32), ``key`` (UInt32, what random numbers are drawn by: it depends on
+    the element alone, not on what else was split before), ``u0``, ``v0``, ``scale`` (Float), ``area``
+    and ``open_area`` (Float, m²; the second without what lies inside solids, see `find_covered`),
+    ``reflectance`` (Color3f, the mean over the element).
     """
 
     def __init__(self, model):
@@ -25,6 +27,7 @@ class Elements:
         self.patch = dr.arange(mi.UInt32, n)
         self.parent = dr.arange(mi.UInt32, n)
         self.child = dr.zeros(mi.UInt32, n)
+        self.key = dr.arange(mi.UInt32, n)
         self.u0, self.v0 = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.scale = dr.full(mi.Float, 1, n)
         self.area = self.open_area = mi.Float(model.area)
@@ -58,12 +61,13 @@ class Elements:
         self.patch = concat(self.patch, patch)
         self.parent = concat(self.parent, parent)
         self.child = concat(self.child, dr.zeros(mi.UInt32, 4 * count))
+        self.key = concat(self.key, hash_pair(dr.gather(mi.UInt32, self.key, parent), which + 1))
         self.u0, self.v0 = concat(self.u0, u0), concat(self.v0, v0)
         self.scale = concat(self.scale, scale)
         self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * .25)
         self.reflectance = concat(self.reflectance, reflectance)
         self.leaves += 3 * count
-        dr.eval(self.patch, self.parent, self.child, self.u0, self.v0, self.scale, self.area, self.reflectance)
+        dr.eval(self.patch, self.parent, self.child, self.key, self.u0, self.v0, self.scale, self.area, self.reflectance)
 
     def _mean_reflectance(self, patch, u0, v0, scale):
         """ρ averaged over four points of each element (Color3f)."""

@@ -41,10 +41,11 @@ class Starved:
         e, k = self.elements, dr.arange(mi.UInt32, self.rays // 2)
         each = opaque_index(self.samples)
         leaf, line = dr.gather(mi.UInt32, self.leaves, k // each), k % each
-        x0, x1, s, t = kronecker(line, leaf, self.seed)
+        key = dr.gather(mi.UInt32, e.key, leaf)
+        x0, x1, s, t = kronecker(line, key, self.seed)
         patch = dr.gather(mi.UInt32, e.patch, leaf)
         u, v = e.patch_point(leaf, *triangle(x0, x1))
-        direct = self._from_lamps(patch, u, v, line, leaf, s, t)
+        direct = self._from_lamps(patch, u, v, line, key, s, t)
         indirect = self._from_room(patch, u, v, s, t, flow)
 
         leaves = e.leaf_indices()
@@ -56,7 +57,7 @@ class Starved:
             dr.scatter(field, mean, self.leaves)
             setattr(flow, name, pull(e, leaves, area, [mi.Float64(dr.gather(mi.Float, c, leaves)) for c in field]))
 
-    def _from_lamps(self, patch, u, v, line, leaf, s, t):
+    def _from_lamps(self, patch, u, v, line, key, s, t):
         """E F / p along lines to points of the lamps, drawn by power (Color3f [lines])."""
         model = self.elements.model
         lamps = dr.compress(dr.max(model.emission) > 0)
@@ -66,7 +67,7 @@ class Starved:
         cumulative = dr.cumsum(mi.UInt64(dr.ceil(power * dr.opaque(mi.Float64, WEIGHTS / whole))))
         dr.eval(cumulative)
         # Stratified over the lamps' power.
-        draw = (mi.Float64(line) + mi.sample_tea_float32(leaf ^ 0xA511E9B3, self.seed, ROUNDS)) / mi.Float64(opaque_index(self.samples))
+        draw = (mi.Float64(line) + mi.sample_tea_float32(key ^ 0xA511E9B3, self.seed, ROUNDS)) / mi.Float64(opaque_index(self.samples))
         j = lower_bound(cumulative, mi.UInt64(draw * dr.opaque(mi.Float64, WEIGHTS)) + 1)
         E = dr.gather(mi.Color3f, emission, j)
         F = model.kernel(patch, u, v, dr.gather(mi.UInt32, lamps, j), *triangle(s, t))

@@ -4,7 +4,7 @@ import mitsuba as mi
 
 from ..oracles import KernelSamples, Pair
 from ..scene.model import NONE
-from ..scene.sampling import kronecker, triangle
+from ..scene.sampling import hash_pair, kronecker, triangle
 from .arrays import concat, lower_bound, opaque_index
 from .elements import MAX_LEVEL
 
@@ -110,8 +110,9 @@ class Pairs:
         e, lines = self.elements, dr.opaque(mi.UInt32, self.lines)
         k = dr.arange(mi.UInt32, dr.width(pairs) * self.lines)
         pair = dr.gather(mi.UInt32, pairs, k // lines)
-        x0, x1, y0, y1 = kronecker(k % lines, pair, self.seed)
         i, j = dr.gather(mi.UInt32, self.receiver, pair), dr.gather(mi.UInt32, self.source, pair)
+        key = hash_pair(dr.gather(mi.UInt32, e.key, i), dr.gather(mi.UInt32, e.key, j))
+        x0, x1, y0, y1 = kronecker(k % lines, key, self.seed)
         ui, vi = e.patch_point(i, *triangle(x0, x1))
         uj, vj = e.patch_point(j, *triangle(y0, y1))
         return e.model.kernel(dr.gather(mi.UInt32, e.patch, i), ui, vi, dr.gather(mi.UInt32, e.patch, j), uj, vj)

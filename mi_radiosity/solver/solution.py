@@ -13,7 +13,8 @@ from ..scene.model import owned
 from .elements import Elements
 
 FORMAT = 1
-TREE = ("patch", "parent", "child", "u0", "v0", "scale", "open_area")
+TREE = ("patch", "parent", "child", "key", "u0", "v0", "scale", "open_area")
+COLORS = ("reflectance", "direct", "indirect")
 
 
 @dataclass
@@ -47,7 +48,7 @@ class Solution:
         """Write the solution as NumPy archive (.npz); no file is left half-written."""
         e = self.elements
         arrays = {name: np.array(getattr(e, name)) for name in TREE}
-        for name, color in (("reflectance", e.reflectance), ("direct", self.direct), ("indirect", self.indirect)):
+        for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
         with writing(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, format=FORMAT, fingerprint=self.model.fingerprint, sides=self.model.sides,
@@ -65,7 +66,8 @@ class Solution:
             if int(data["format"]) != FORMAT:
                 raise RadiosityError(f"{path} was written by another version: solve the scene again")
             stats = json.loads(str(data["stats"]))
-            fingerprint = str(data["fingerprint"])
+            fingerprint, sides = str(data["fingerprint"]), data["sides"]
+            tree, colors = {name: data[name] for name in TREE}, {name: data[name] for name in COLORS}
         except FileNotFoundError:
             raise RadiosityError(f"{path} does not exist: save a solution first") from None
         except RadiosityError:
@@ -75,13 +77,12 @@ class Solution:
         model = scene if isinstance(scene, Model) else Model(scene)
         if fingerprint != model.fingerprint:
             raise RadiosityError(f"{path} belongs to another scene: solve this one, or load the scene it was saved from")
-        model.use_sides(data["sides"])
+        model.use_sides(sides)
         elements = Elements(model)
-        for name in TREE:
-            kind = mi.UInt32 if data[name].dtype.kind == "u" else mi.Float
-            setattr(elements, name, owned(kind, data[name]))
-        def color(name): return mi.Color3f(*(owned(mi.Float, c) for c in data[name]))
+        for name, array in tree.items():
+            setattr(elements, name, owned(mi.UInt32 if array.dtype.kind == "u" else mi.Float, array))
+        def color(name): return mi.Color3f(*(owned(mi.Float, c) for c in colors[name]))
         elements.reflectance = color("reflectance")
         elements.area = dr.gather(mi.Float, model.area, elements.patch) * elements.scale ** 2
-        elements.leaves = int((data["child"] == 0).sum())
+        elements.leaves = int((tree["child"] == 0).sum())
         return Solution(model, elements, color("direct"), color("indirect"), stats)

@@ -1,0 +1,157 @@
+"""What goes wrong around a solve: threads, processes, interruptions, disks."""
+import os
+import re
+import subprocess
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import ORACLES
+
+import mi_radiosity as mr
+from mi_radiosity.scene import Model
+
+SOLVE = """
+import mi_radiosity as mr, mitsuba as mi, numpy as np, sys
+mi.set_variant("llvm_ad_rgb")
+solution = mr.solve(mi.load_dict(mi.cornell_box()), elements=1500, rays=100_000, seed=5)
+np.save(sys.argv[1], np.array(solution.radiosity()))
+"""
+
+
+@pytest.fixture
+def threads():
+    """dr.set_thread_count, put back afterwards."""
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
+@pytest.mark.parametrize("oracle", ORACLES, ids=str)
+def test_threads_do_not_matter(cornell, threads, oracle):
+    """One thread and two give the same mesh and the same values to 1e-6."""
+    solutions = []
+    for count in (1, 2):
+        threads(count)
+        solutions.append(mr.solve(cornell, oracle, elements=1500, rays=100_000, seed=5))
+    one, two = solutions
+    np.testing.assert_array_equal(np.array(one.elements.child), np.array(two.elements.child))
+    np.testing.assert_allclose(np.array(one.radiosity()), np.array(two.radiosity()), rtol=1e-6)
+
+
+def test_processes_do_not_matter(tmp_path):
+    """Two processes at the same time, one on one thread, give the same values to 1e-6."""
+    files = [tmp_path / f"{k}.npy" for k in range(2)]
+    runs = [subprocess.Popen([sys.executable, "-c", SOLVE, str(f)], env={**os.environ, "DRJIT_NUM_THREADS": str(k + 1)}, stderr=subprocess.PIPE) for k, f in enumerate(files)]
+    for run in runs:
+        _, said = run.communicate(timeout=300)
+        assert run.returncode == 0, said.decode()
+    np.testing.assert_allclose(*map(np.load, files), rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def solution(cornell):
+    return mr.solve(cornell, elements=500, rays=20_000)
+
+
+def no_space(*args, **kwargs):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("call", ["numpy.savez_compressed", "os.replace"])
+def test_a_full_disk_leaves_the_old_file(solution, tmp_path, monkeypatch, call):
+    """One line that names the file; what was there stays, and nothing else does."""
+    file = tmp_path / "kept.npz"
+    solution.save(file)
+    before = file.read_bytes()
+    monkeypatch.setattr(call, no_space)
+    with pytest.raises(mr.RadiosityError, match=re.escape(f"cannot write {file} (No space left on device)")):
+        solution.save(file)
+    assert os.listdir(tmp_path) == ["kept.npz"] and file.read_bytes() == before
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
+def test_a_device_that_is_really_full(solution, monkeypatch):
+    """Bytes that do not fit are an error, not a short file."""
+    import builtins
+    def full(path, mode="r", *rest, **more):
+        return real("/dev/full" if "w" in mode else path, mode, *rest, **more)
+    real = builtins.open
+    monkeypatch.setattr("mi_radiosity.solver.solution.open", full, raising=False)
+    with pytest.raises(mr.RadiosityError, match="No space left"):
+        solution.save("never.npz")
+    assert not os.path.exists("never.npz")
+
+
+@pytest.mark.parametrize("share", [0, .01, .3, .9, .999])
+def test_truncated_solutions_are_refused(solution, cornell, tmp_path, share):
+    file = tmp_path / "kept.npz"
+    solution.save(file)
+    whole = file.read_bytes()
+    file.write_bytes(whole[:int(share * len(whole))])
+    with pytest.raises(mr.RadiosityError, match="not a readable solution"):
+        mr.Solution.load(file, cornell)
+
+
+@pytest.mark.parametrize("byte", [.2, .4, .6, .8])
+def test_damaged_solutions_are_refused(solution, cornell, tmp_path, byte):
+    """A flipped byte inside of an array does not pass for data."""
+    file = tmp_path / "kept.npz"
+    solution.save(file)
+    data = bytearray(file.read_bytes())
+    data[int(byte * len(data))] ^= 0xFF
+    file.write_bytes(data)
+    with pytest.raises(mr.RadiosityError, match="not a readable solution"):
+        mr.Solution.load(file, cornell)
+
+
+@pytest.mark.parametrize("missing", ["direct", "child", "sides", "stats"])
+def test_incomplete_solutions_are_refused(solution, cornell, tmp_path, missing):
+    """An archive of the right format without one of its arrays is damaged, too."""
+    file = tmp_path / "kept.npz"
+    solution.save(file)
+    with np.load(file) as kept:
+        arrays = {k: v for k, v in kept.items() if k != missing}
+    np.savez(file, **arrays)
+    with pytest.raises(mr.RadiosityError, match="not a readable solution"):
+        mr.Solution.load(file, cornell)
+
+
+@pytest.mark.parametrize("stage", ["refine", "distribute"])
+def test_interrupted_solves_leave_nothing_behind(cornell, stage):
+    """Ctrl-C comes out as KeyboardInterrupt, and the next solve is as if it had not been."""
+    model = Model(cornell)
+    clean = mr.solve(model, elements=1000, rays=50_000)
+
+    def interrupt(now, done, total):
+        if now == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mr.solve(model, elements=1000, rays=50_000, progress=interrupt)
+    again = mr.solve(model, elements=1000, rays=50_000)
+    np.testing.assert_array_equal(np.array(clean.radiosity()), np.array(again.radiosity()))
+
+
+def test_an_interrupted_save_keeps_the_old_file(solution, tmp_path, monkeypatch):
+    file = tmp_path / "kept.npz"
+    solution.save(file)
+    before = file.read_bytes()
+    def interrupt(*args, **kwargs): raise KeyboardInterrupt
+    monkeypatch.setattr("numpy.savez_compressed", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        solution.save(file)
+    assert os.listdir(tmp_path) == ["kept.npz"] and file.read_bytes() == before
+
+
+def test_a_plugin_that_was_interrupted_solves_again(cornell):
+    """No half-done solution is shown afterwards."""
+    plugin = mi.load_dict({"type": "radiosity", "elements": 500, "rays": 20_000})
+    def interrupt(*args): raise KeyboardInterrupt
+    plugin.progress = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        plugin.prepare(cornell)
+    plugin.progress = None
+    assert plugin.prepare(cornell).stats["rays"] == 20_000

@@ -1,0 +1,80 @@
+"""Three hundred random scenes and what must hold in all of them."""
+import mitsuba as mi
+import numpy as np
+from conftest import ORACLES, balance, border_values, diffuse, icosphere, lamp, leaf_values, mesh, rectangle, scene
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+import mi_radiosity as mr
+from mi_radiosity.scene import Model
+
+BALLS = {k: icosphere(k, inwards=False) for k in (0, 1)}
+
+
+def numbers(low, high):
+    return st.floats(low, high)
+
+
+@st.composite
+def placements(draw):
+    """A turn, a size per axis, a mirror perhaps, and a place in or about the room."""
+    axis = np.array(draw(st.tuples(*3 * [numbers(-1, 1)]))) + [0, 0, 1.5]
+    size = np.array(draw(st.tuples(*3 * [numbers(.05, .6)]))) * draw(st.sampled_from([1, -1]))
+    place = draw(st.tuples(*3 * [numbers(-1.2, 1.2)]))
+    axis = axis / np.linalg.norm(axis)
+    return mi.ScalarTransform4f().translate(list(place)).rotate(list(axis), draw(numbers(0, 360))).scale(list(size))
+
+
+@st.composite
+def shapes(draw):
+    """A box, a triangle ball or a plate, one- or two-sided, dark or lit."""
+    kind = draw(st.sampled_from(["box", "ball", "plate"]))
+    bsdf = diffuse(draw(st.sampled_from([0.0, .2, .5, .8, .95])), two_sided=draw(st.booleans()))
+    emitter = {"emitter": lamp(draw(st.sampled_from([.01, 1, 1000])))} if draw(st.integers(0, 3)) == 0 else {}
+    to_world = draw(placements())
+    if kind == "ball":
+        vertices, faces = BALLS[draw(st.integers(0, 1))]
+        matrix = np.array(to_world.matrix)
+        return mesh(vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, bsdf, emitter.get("emitter"))
+    return {"type": "cube" if kind == "box" else "rectangle", "to_world": to_world, "bsdf": bsdf, **emitter}
+
+
+@st.composite
+def scenes(draw):
+    """Up to five shapes and a lamp, in a closed room or in the open."""
+    parts = {f"shape{k}": shape for k, shape in enumerate(draw(st.lists(shapes(), max_size=5)))}
+    if draw(st.booleans()):
+        parts["room"] = {"type": "cube", "flip_normals": True, "bsdf": diffuse(draw(st.sampled_from([.1, .5, .9])))}
+    parts["lamp"] = rectangle(draw(placements()), bsdf=diffuse(.5), emitter=lamp(draw(st.sampled_from([.1, 1, 10]))))
+    return scene(optimize=False, **parts)
+
+
+def continuous(solution):
+    """Do leaves agree wherever they meet on one surface?"""
+    points, normals, values = border_values(solution)
+    key = np.round(np.hstack([points * 2 ** 14, normals * 100])).astype(np.int64)
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    low, high = np.full((group.max() + 1, 3), np.inf), np.full((group.max() + 1, 3), -np.inf)
+    np.minimum.at(low, group.ravel(), values)
+    np.maximum.at(high, group.ravel(), values)
+    return (high - low).max() <= 1e-4 * max(values.max(), 1e-30)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@given(scenes(), st.sampled_from(ORACLES), st.integers(0, 2 ** 32 - 1))
+def test_any_scene(parts, oracle, seed):
+    """Energy kept, B ≥ 0 and finite, leaves partition patches, children fill parents, the picture has no cracks."""
+    model = Model(parts)
+    try:
+        solution = mr.solve(model, oracle, elements=model.count + 150, rays=4000, seed=seed)
+    except mr.RadiosityError as error:      # nothing near a lone lamp
+        assert "nothing left to refine" in str(error)
+        solution = mr.solve(model, oracle, epsilon=1e-3, rays=4000, seed=seed)
+    assert abs(balance(solution) - 1) < 1e-3
+    values, areas, patches = leaf_values(solution)
+    assert np.isfinite(values).all() and (values >= 0).all()
+    np.testing.assert_allclose(np.bincount(patches, weights=areas, minlength=model.count), np.array(model.area), rtol=1e-5)
+    child, area = np.array(solution.elements.child), np.array(solution.elements.area)
+    inner = np.flatnonzero(child)
+    np.testing.assert_allclose(area[child[inner, None] + np.arange(4)].sum(axis=1), area[inner], rtol=1e-6)
+    assert continuous(solution)
