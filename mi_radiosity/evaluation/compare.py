@@ -154,7 +154,7 @@ def executor_for(scheduler):
     except ImportError:
         raise RadiosityError("--scheduler needs Dask: pip install 'mi_radiosity[dask]'") from None
     try:
-        return Client(scheduler, timeout="20s").get_executor(retries=0)
+        return Client(scheduler, timeout="5s").get_executor(retries=0)
     except (OSError, ValueError) as error:
         raise RadiosityError(f"no Dask scheduler answers at {scheduler} ({error}): check the address") from None
 
