@@ -49,15 +49,15 @@ def scenes(draw):
     return scene(optimize=False, **parts)
 
 
-def continuous(solution):
-    """Do leaves agree wherever they meet on one surface?"""
+def gap_between_leaves(solution):
+    """Largest difference, relative to the brightest value, between leaves where they meet on one surface."""
     points, normals, values = border_values(solution)
     key = np.round(np.hstack([points * 2 ** 14, normals * 100])).astype(np.int64)
     _, group = np.unique(key, axis=0, return_inverse=True)
     low, high = np.full((group.max() + 1, 3), np.inf), np.full((group.max() + 1, 3), -np.inf)
     np.minimum.at(low, group.ravel(), values)
     np.maximum.at(high, group.ravel(), values)
-    return (high - low).max() <= 1e-4 * max(values.max(), 1e-30)
+    return (high - low).max() / max(values.max(), 1e-30)
 
 
 @settings(max_examples=300, deadline=None, derandomize=True, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
@@ -77,4 +77,5 @@ def test_any_scene(parts, oracle, seed):
     child, area = np.array(solution.elements.child), np.array(solution.elements.area)
     inner = np.flatnonzero(child)
     np.testing.assert_allclose(area[child[inner, None] + np.arange(4)].sum(axis=1), area[inner], rtol=1e-6)
-    assert continuous(solution)
+    # Where surfaces lie in one another only one is shown, and they share no vertices.
+    assert gap_between_leaves(solution) < 1e-4 or model.overlaps
