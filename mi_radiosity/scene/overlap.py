@@ -52,7 +52,12 @@ class Overlaps:
         """Ordered pairs (f, g) of coplanar faces whose interiors meet (two int [pairs])."""
         low, high = self.corners.min(axis=1), self.corners.max(axis=1)
         found = [np.zeros((0, 2), dtype=np.int64)]
-        for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), self.tolerance):
+        offset = (self.corners[:, 0] * normal).sum(axis=1)
+
+        def near_plane(f, g):
+            return np.abs(np.einsum("ij,ij->i", self.corners[g, 0], normal[f]) - offset[f]) <= 2 * self.tolerance
+
+        for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), self.tolerance, near_plane):
             # f is not much smaller than g: it defines the plane.
             x = self.corners[g] - self.corners[f, :1]
             near = np.abs((x * normal[f, None]).sum(axis=2)).max(axis=1) <= self.tolerance
@@ -118,8 +123,8 @@ class Overlaps:
         return side >> 1, (side & 1) == 1, u, v
 
 
-def _boxes_that_meet(low, high, faces, tolerance):
-    """Yield pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge; the first is of the size of the second at least."""
+def _boxes_that_meet(low, high, faces, tolerance, likely):
+    """Yield ``likely`` pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge; the first is of the size of the second at least."""
     low, high = low - low.min(axis=0) - tolerance, high - low.min(axis=0) + tolerance
     level = np.frexp((high - low).max(axis=1))[1]
     for size in np.unique(level[faces]):
@@ -142,7 +147,7 @@ def _boxes_that_meet(low, high, faces, tolerance):
             each = count[part]
             g = np.repeat(there[part], each)
             f = there[largest[np.repeat(start[part], each) + np.arange(len(g)) - np.repeat(np.cumsum(each) - each, each)]]
-            near = (f < g) | (level[g] < size)
+            near = ((f < g) | (level[g] < size)) & likely(f, g)      # first, as few pass
             f, g = f[near], g[near]
             shared = np.minimum(high[f], high[g]) - np.maximum(low[f], low[g]) - 2 * tolerance
             near = (shared > -tolerance).all(axis=1) & ((shared > tolerance / 2).sum(axis=1) > 1)
