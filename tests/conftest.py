@@ -18,7 +18,8 @@ def cornell():
 
 def scene(optimize=True, **shapes):
     """A scene of shapes given as dictionaries, with a small camera; ``optimize`` merges those that share a BSDF."""
-    camera = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]), "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}
+    camera = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+              "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}
     return mi.load_dict({"type": "scene", "camera": camera, **shapes}, optimize=optimize)
 
 
@@ -117,3 +118,19 @@ def border_values(solution):
     patch = dr.gather(mi.UInt32, e.patch, index)
     values = np.array(mi_radiosity.display.Field(solution).at(index, u, v)).T
     return np.array(model.point(patch, u, v)).T, np.array(dr.gather(mi.Vector3f, model.normal, patch)).T, values
+
+
+def wall_means(solution):
+    """Mean radiosity of every wall {number: [3]}; what lies inside solids counts as dark, as it does for others."""
+    values, areas, patches = leaf_values(solution)
+    leaves = np.array(solution.elements.child) == 0
+    values = values * (np.array(solution.elements.open_area)[leaves] / areas)[:, None]
+    walls = names_of_walls(solution.model)
+    return {wall: np.average(values[walls[patches] == wall], axis=0, weights=areas[walls[patches] == wall]) for wall in np.unique(walls)}
+
+
+def names_of_walls(model):
+    """One number per patch, the same for patches of one reflectance in one plane."""
+    normal, point = np.array(model.normal).T, np.array(model.p0).T
+    key = np.column_stack([normal, (normal * point).sum(axis=1), np.array(model.reflectance).T]).round(2) + 0.0
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel()

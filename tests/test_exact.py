@@ -3,30 +3,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import diffuse, group, icosphere, lamp, leaf_corners, leaf_values, mesh, quad, rectangle, scene
+from conftest import diffuse, icosphere, lamp, leaf_corners, leaf_values, mesh, names_of_walls, quad, rectangle, scene, wall_means
 from scipy import stats
-from scipy.spatial import cKDTree
 
 import mi_radiosity as mr
 from mi_radiosity.scene import Model
 
 T = mi.ScalarTransform4f
-
-
-def wall_means(solution):
-    """Mean radiosity of every wall {number: [3]}; what lies inside solids counts as dark, as it does for others."""
-    values, areas, patches = leaf_values(solution)
-    leaves = np.array(solution.elements.child) == 0
-    values = values * (np.array(solution.elements.open_area)[leaves] / areas)[:, None]
-    walls = names_of_walls(solution.model)
-    return {wall: np.average(values[walls[patches] == wall], axis=0, weights=areas[walls[patches] == wall]) for wall in np.unique(walls)}
-
-
-def names_of_walls(model):
-    """One number per patch, the same for patches of one reflectance in one plane."""
-    normal, point = np.array(model.normal).T, np.array(model.p0).T
-    key = np.column_stack([normal, (normal * point).sum(axis=1), np.array(model.reflectance).T]).round(2) + 0.0
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
 
 
 def errors(solution, exact):
@@ -183,59 +166,8 @@ def test_path_agrees_on_every_wall(cornell_solution):
     area = np.bincount(names_of_walls(model), weights=np.array(model.area))
     for wall, (mean, error) in path_means(model).items():
         allowed = .01 if area[wall] > 1 else .03
+        print(wall, area[wall], (ours[wall]/mean-1), error/mean)
         assert (np.abs(ours[wall] - mean) < 3.29 * error + allowed * mean).all(), f"wall {wall}: {ours[wall]} is not {mean} ± {error}"
-
-
-# ---- What must not change the solution ----------------------------------------------------------
-
-def two_lamps(first, second):
-    """A room with two lamps of given E; 1e-6 stands for a lamp that is off, so that the scene stays the same."""
-    down = T().translate([-.5, 0, .9]).rotate([1, 0, 0], 180)
-    return scene(room={"type": "cube", "flip_normals": True, "bsdf": diffuse(.5)}, a=rectangle(down.scale(.2), bsdf=diffuse(.5), emitter=lamp(first)),
-                 b=rectangle(T().translate([1, 0, 0]) @ down @ T().scale(.15), bsdf=diffuse(.5), emitter=lamp(second)))
-
-
-def test_superposition_of_two_lamps():
-    """The solutions of two lamps add up to that of both, wall by wall, to 1 %."""
-    one, two, both = (wall_means(mr.solve(two_lamps(*e), mr.Uniform(), elements=1500, rays=2_000_000)) for e in ((1, 1e-6), (1e-6, 2), (1, 2)))
-    for wall in both:
-        np.testing.assert_allclose(one[wall] + two[wall], both[wall], rtol=.01)
-
-
-def test_doubling_the_light_doubles_the_solution():
-    """The mesh stays the same, and every value doubles exactly: powers of two round nothing."""
-    one, two = (mr.solve(two_lamps(e, e), elements=1500, rays=300_000) for e in (1, 2))
-    np.testing.assert_array_equal(np.array(one.elements.parent), np.array(two.elements.parent))
-    np.testing.assert_allclose(2 * np.array(one.radiosity()), np.array(two.radiosity()), rtol=1e-6)
-
-
-def transformed_box(scale, move):
-    """A box with a lamp that hangs in it, everything scaled and moved."""
-    place = T().translate(move).scale(scale)
-    return scene(room={"type": "cube", "flip_normals": True, "bsdf": diffuse(.5), "to_world": place},
-                 lamp=rectangle(place @ T().translate([.2, .1, .9]).rotate([1, 0, 0], 180).scale(.25), bsdf=diffuse(.5), emitter=lamp()),
-                 plate=rectangle(place @ T().translate([-.3, .2, -.4]).scale(.4), bsdf=diffuse(.3, two_sided=True)))
-
-
-@pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (7.3, 0), (1e3, 1e4), (100, 1e4)], ids=str)
-def test_scale_and_place_do_not_matter(scale, move):
-    """Scaled: the same leaves. Moved: of a hundred leaves 85 at least, as a ray that rounding sends elsewhere changes what is known of B. Means to 1 %."""
-    reference, other = (mr.solve(transformed_box(*how), elements=2000, rays=1_000_000) for how in ((1, [0, 0, 0]), (scale, [move, -move, move])))
-    def leaves(solution, scale):
-        corners = (leaf_corners(solution) - solution.model.centre) / scale
-        return np.column_stack([corners.mean(axis=1), np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)])
-    distance, _ = cKDTree(leaves(reference, 1)).query(leaves(other, scale))
-    assert (distance < 5e-3).mean() > (.85 if move else .99)
-    values = [solution.radiosity() for solution in (reference, other)]
-    means = [np.average(np.array(v)[0, :s.model.count], weights=np.array(s.model.area)) for v, s in zip(values, (reference, other))]
-    assert means[1] == pytest.approx(means[0], rel=.01)
-
-
-@pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (1e3, 1e4)], ids=str)
-def test_an_epsilon_means_the_same_mesh_anywhere(scale, move):
-    """σ of GMI has no unit: at one ε the mesh has the same number of elements, to 1 %; 2 % where corners are rounded to 1e-3 of the room."""
-    counts = [mr.solve(transformed_box(*how), epsilon=3e-7, rays=10_000).stats["elements"] for how in ((1, [0, 0, 0]), (scale, [move, -move, move]))]
-    assert counts[0] > 300 and counts[1] == pytest.approx(counts[0], rel=.02 if move > scale * 100 else .01)
 
 
 def test_noise_falls_with_rays_and_mesh_error_with_elements():

@@ -91,7 +91,8 @@ def interpenetrating_boxes():
         corners = leaf_corners(solution)                            # [leaves, 3, 3]
         values, _, patches = leaf_values(solution)
         def inside(low, high): return ((corners > np.add(low, 1e-3)) & (corners < np.subtract(high, 1e-3))).all(axis=(1, 2))
-        hidden = (inside([-2, -2, -5], [0, 0, -3]) & np.isin(patches, group(solution.model, FLOOR))) | (inside([-1, -1, -4], [1, 1, -2]) & np.isin(patches, group(solution.model, OTHER)))
+        in_a, in_b = inside([-2, -2, -5], [0, 0, -3]), inside([-1, -1, -4], [1, 1, -2])
+        hidden = (in_a & np.isin(patches, group(solution.model, FLOOR))) | (in_b & np.isin(patches, group(solution.model, OTHER)))
         assert (values[hidden] == 0).all() and (values[~hidden].max(axis=1) > 0).mean() > 0.8
     return scene(room=room(), lamp=rectangle(T().translate([0, 0, 4.9]).rotate([1, 0, 0], 180), bsdf=diffuse(LAMP), emitter=lamp()),
                  a=box(T().translate([-1, -1, -4]), OTHER), b=box(T().translate([0, 0, -3]), FLOOR)), check
@@ -137,7 +138,8 @@ def open_scene():
 def tiny_lamp():
     """A lamp of 1e-8 of the area of the room."""
     half = (600 * 1e-8) ** .5 / 2
-    return scene(room=room(), lamp=rectangle(T().translate([0, 0, 4.9]).rotate([1, 0, 0], 180).scale(half), bsdf=diffuse(WALL), emitter=lamp())), closed_room_is_right(600e-8, 600)
+    down = T().translate([0, 0, 4.9]).rotate([1, 0, 0], 180).scale(half)
+    return scene(room=room(), lamp=rectangle(down, bsdf=diffuse(WALL), emitter=lamp())), closed_room_is_right(600e-8, 600)
 
 
 def many_lamps():
@@ -208,7 +210,8 @@ def test_holds_for_every_oracle(case, oracle):
 @pytest.mark.parametrize("other", [OTHER, FLOOR])
 def test_coincident_faces_do_not_speckle(other):
     """Rays that come down on the floor meet one and the same of three coincident plates, whoever looks."""
-    model = Model(scene(lamp=ceiling(), floor=quad(SQUARE, bsdf=diffuse(FLOOR)), a=quad(np.roll(SQUARE, 1, axis=0), bsdf=diffuse(other)), b=quad(SQUARE, bsdf=diffuse(.7))))
+    plates = {"floor": quad(SQUARE, bsdf=diffuse(FLOOR)), "a": quad(np.roll(SQUARE, 1, axis=0), bsdf=diffuse(other)), "b": quad(SQUARE, bsdf=diffuse(.7))}
+    model = Model(scene(lamp=ceiling(), **plates))
     grid = np.random.default_rng(0).uniform(-1, 1, (2, 20_000)).astype(np.float32)
     for slope in (0, .3, 3):
         x = mi.Point3f(mi.Float(grid[0]) - slope * .5, mi.Float(grid[1]), .5)

@@ -26,7 +26,7 @@ class Overlaps:
     def __init__(self, corners, normal, area, sound, rank, present, exitance, reflectance, tolerance):
         self.corners, self.tolerance = corners, tolerance
         self.covered, self._present = np.zeros(present.shape, dtype=bool), present.ravel().copy()
-        f, g = self._pairs(normal, sound)
+        f, g = self._pairs(normal, area, sound)
         self._side = self._other = np.zeros(0, dtype=np.int64)
         if not len(f):
             return
@@ -48,17 +48,23 @@ class Overlaps:
     def __bool__(self):
         return bool(len(self._side))
 
-    def _pairs(self, normal, sound):
+    def _pairs(self, normal, area, sound):
         """Ordered pairs (f, g) of coplanar faces whose interiors meet (two int [pairs])."""
         low, high = self.corners.min(axis=1), self.corners.max(axis=1)
         found = [np.zeros((0, 2), dtype=np.int64)]
         offset = (self.corners[:, 0] * normal).sum(axis=1)
 
+        def by_area(f, g):
+            """The larger face first: it knows its plane best."""
+            larger = area[f] >= area[g]
+            return np.where(larger, f, g), np.where(larger, g, f)
+
         def near_plane(f, g):
+            f, g = by_area(f, g)
             return np.abs(np.einsum("ij,ij->i", self.corners[g, 0], normal[f]) - offset[f]) <= 2 * self.tolerance
 
         for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), self.tolerance, near_plane):
-            # f is not much smaller than g: it defines the plane.
+            f, g = by_area(f, g)
             x = self.corners[g] - self.corners[f, :1]
             near = np.abs((x * normal[f, None]).sum(axis=2)).max(axis=1) <= self.tolerance
             f, g = f[near], g[near]
@@ -111,7 +117,7 @@ class Overlaps:
         u, v = mi.Float(u), mi.Float(v)
         while active & (at < end):
             other = dr.gather(mi.UInt32, self._others, at)
-            q0, q1, q2 = dr.gather(mi.Point3f, self._tables[0], other >> 1), dr.gather(mi.Vector3f, self._tables[1], other >> 1), dr.gather(mi.Vector3f, self._tables[2], other >> 1)
+            q0, q1, q2 = (dr.gather(type(t), t, other >> 1) for t in self._tables)
             normal = dr.cross(q1, q2)
             n2 = dr.squared_norm(normal)
             a, b = dr.dot(dr.cross(x - q0, q2), normal) / n2, dr.dot(dr.cross(q1, x - q0), normal) / n2
