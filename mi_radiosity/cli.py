@@ -226,7 +226,7 @@ def _info(arguments):
     table = Table(title=str(arguments.scene), title_justify="left", show_header=False)
     power = [dr.sum(e * model.area)[0] for e in model.emission]
     lamps = int(dr.sum(dr.select(dr.max(model.emission) > 0, mi.UInt32(1), 0))[0])
-    for name, value in (("shapes", f"{len(scene.shapes()):,}"), ("faces", f"{len(model.face_shape):,}"),
+    for name, value in (("shapes", f"{len(scene.shapes()):,}"), ("faces", f"{len(model.faces.shape):,}"),
                         ("patches", f"{model.count:,} ({fronts:,} fronts, {model.count - fronts:,} backs)"),
                         ("sides no light reaches", f"{model.unreached:,}, left out"),
                         ("area of patches", f"{model.total_area:.6g}"),

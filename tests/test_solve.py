@@ -70,6 +70,21 @@ def test_direct_and_indirect_are_apart():
     assert indirect[roots].max() < mean
 
 
+def test_what_lies_inside_solids_is_left_out():
+    """A box of 1 × 1 m on a floor of 2 × 2 m leaves 3 m² of it open; power goes there, none is lost inside."""
+    T = mi.ScalarTransform4f
+    room = scene(floor=rectangle(bsdf=diffuse(0.9)), box={"type": "cube", "to_world": T().translate([0.1, 0.1, 0.5]).scale(0.5), "bsdf": diffuse(0.5)},
+                 lamp=rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180), bsdf=diffuse(0.5), emitter=lamp()))
+    solution = mr.solve(room, elements=1000, rays=200_000)
+    leaves = np.array(solution.elements.child) == 0
+    patch, open_area = (np.array(x)[leaves] for x in (solution.elements.patch, solution.elements.open_area))
+    height, up = np.array(solution.model.corner(0))[2], np.array(solution.model.normal)[2]
+    floor = (height == 0) & (up > 0)
+    assert open_area[floor[patch]].sum() == pytest.approx(3, rel=0.01)
+    power = solution.stats["power"]
+    assert power["emitted"] == pytest.approx(power["absorbed"] + power["escaped"], rel=1e-3)
+
+
 def test_an_oracle_of_ones_own(cornell):
     class Variance(mr.Oracle):
         name = "variance"

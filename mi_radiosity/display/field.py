@@ -198,7 +198,7 @@ def _weld(model):
     for k, (u, v) in enumerate(CORNERS):
         one = dr.full(mi.Float, 1, model.count)
         point = model.corner(k)
-        normal = model.surface(face, one * u, one * v).sh_frame.n * dr.select(back, -1, 1)
+        normal = model.faces.surface(face, one * u, one * v).sh_frame.n * dr.select(back, -1, 1)
         key = mi.UInt64(0x9E3779B97F4A7C15)
         for x in point:
             key = _mix(key ^ mi.UInt64(dr.reinterpret_array(mi.UInt32, x + 0.0)))

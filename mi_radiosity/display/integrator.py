@@ -75,7 +75,7 @@ def _integrator_class():
             if model.textured and model.overlaps:
                 # The face shown need not be the one the ray met.
                 patch = dr.select(lit, hit.patch, 0)
-                reflectance = model.reflectance_at(dr.gather(mi.UInt32, model.face, patch), hit.u, hit.v, dr.gather(mi.Bool, model.back, patch))
+                reflectance = model.faces.reflectance_at(dr.gather(mi.UInt32, model.face, patch), hit.u, hit.v, dr.gather(mi.Bool, model.back, patch))
             elif model.textured:
                 si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, lit)
                 reflectance = si.bsdf().eval_diffuse_reflectance(si, lit)

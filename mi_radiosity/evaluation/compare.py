@@ -112,9 +112,11 @@ def _spend(cell, model, oracle):
     solution = run(cell.elements, cell.rays * (MORE_RAYS if cell.question == "noise" else 1))
     if cell.question in ("mesh", "noise"):
         return solution
-    factor = cell.budget / cost(solution.stats, cell.question)
-    elements = cell.elements * factor
-    solution = run(elements, cell.rays * factor)
+    elements, rays = cell.elements, cell.rays
+    for _ in range(2):                                   # costs are not quite proportional
+        factor = cell.budget / cost(solution.stats, cell.question)
+        elements, rays = elements * factor, rays * factor
+        solution = run(elements, rays)
     stats = solution.stats
     if cell.question == "rays":
         rest = cell.budget - stats["oracle_rays"] - stats["pilot_rays"]

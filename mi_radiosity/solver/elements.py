@@ -74,7 +74,7 @@ class Elements:
         face, back = dr.gather(mi.UInt32, self.model.face, patch), dr.gather(mi.Bool, self.model.back, patch)
         total = mi.Color3f(0)
         for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
-            total += self.model.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
+            total += self.model.faces.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
         return total / 4
 
     def locate(self, element, u, v):

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import RadiosityError
 from ..files import writing
 from ..scene import Model
-from ..scene.model import owned
+from ..scene.faces import owned
 from .elements import Elements
 
 FORMAT = 1
