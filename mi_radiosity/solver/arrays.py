@@ -22,12 +22,17 @@ def concat(*arrays):
     return result
 
 
-@dr.syntax
 def lower_bound(values, key, active=True):
     """First position k of sorted ``values`` with values[k] >= key, at most the last one (UInt32 [n])."""
-    # dr.binary_search unrolls, and so compiles anew whenever the table has doubled.
     low = dr.zeros(mi.UInt32, dr.width(key))
-    high = low + opaque_index(dr.width(values) - 1)
+    return lower_bound_within(values, key, low, low + opaque_index(dr.width(values) - 1), active)
+
+
+@dr.syntax
+def lower_bound_within(values, key, low, high, active=True):
+    """`lower_bound` for entries whose position is known to be in [low, high] (UInt32 [n])."""
+    # dr.binary_search unrolls, and so compiles anew whenever the table has doubled.
+    low, high = mi.UInt32(low), mi.UInt32(high)
     while low < high:
         middle = (low + high) >> 1
         below = dr.gather(type(values), values, middle, active) < key

@@ -42,7 +42,7 @@ class Starved:
         each = opaque_index(self.samples)
         leaf, line = dr.gather(mi.UInt32, self.leaves, k // each), k % each
         key = dr.gather(mi.UInt32, e.key, leaf)
-        x0, x1, s, t = kronecker(line, key, self.seed)
+        x0, x1, s, t = kronecker(line, dr.gather(mi.UInt32, e.key, self.leaves), self.seed, k // each)
         patch = dr.gather(mi.UInt32, e.patch, leaf)
         u, v = e.patch_point(leaf, *triangle(x0, x1))
         direct = self._from_lamps(patch, u, v, line, key, s, t)

@@ -5,7 +5,7 @@ import mitsuba as mi
 from ..oracles import KernelSamples, Pair
 from ..scene.model import NONE
 from ..scene.sampling import hash_pair, kronecker, triangle
-from .arrays import concat, lower_bound, opaque_index
+from .arrays import concat, lower_bound, lower_bound_within, opaque_index
 from .elements import MAX_LEVEL
 
 UNKNOWN = -1.0          # σ of a pair nobody has evaluated
@@ -15,9 +15,10 @@ BATCH = 1 << 18         # pairs sampled in one launch: bounds memory
 class Pairs:
     """Pairs (receiver i, source j) of elements, born of rays.
 
-    Roots are pairs of patches that a ray connects, found by binary search over sorted keys i·2³² + j.
+    Roots are pairs of patches that a ray connects, found by binary search in the row of i of sorted keys i·2³² + j.
     A pair whose larger element is split has four children. Arrays over pairs: ``receiver``,
-    ``source``, ``child`` (first of four, 0 for none; UInt32), ``sigma`` (Float, UNKNOWN before the
+    ``source``, ``child`` (first of four, 0 for none), ``halved`` (2 · the element that was split, + 1 if
+    it is the receiver; UInt32), ``sigma`` (Float, UNKNOWN before the
     one evaluation a pair ever gets), ``partial`` (Bool: a line between the two was blocked, or below
     a horizon, so that light does not spread over all of the receiver).
     """
@@ -27,8 +28,9 @@ class Pairs:
         self.seed = dr.opaque(mi.UInt32, seed)
         self.root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)      # a sentinel, so that the table is never empty
         self.roots = mi.UInt32(NONE)
+        self._index_rows()
         # Pair 0 is never used, so that child == 0 means none.
-        self.receiver, self.source, self.child = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+        self.receiver, self.source, self.child, self.halved = (mi.UInt32(0) for _ in range(4))
         self.sigma, self.partial = mi.Float(0), mi.Bool(False)
         self.evaluated = 0
 
@@ -40,6 +42,7 @@ class Pairs:
         self.source = concat(self.source, source)
         n = dr.width(receiver)
         self.child = concat(self.child, dr.zeros(mi.UInt32, n))
+        self.halved = concat(self.halved, dr.zeros(mi.UInt32, n))
         self.sigma = concat(self.sigma, dr.full(mi.Float, UNKNOWN, n))
         self.partial = concat(self.partial, dr.zeros(mi.Bool, n))
 
@@ -47,9 +50,9 @@ class Pairs:
 
     def find_roots(self, i, j, active):
         """Numbers of the root pairs of patches (i, j), NONE where there is none yet (UInt32 [n])."""
-        key = (mi.UInt64(i) << 32) | mi.UInt64(j)
-        at = lower_bound(self.root_keys, key, active)
-        found = active & (dr.gather(mi.UInt64, self.root_keys, at, active) == key)
+        first, last = dr.gather(mi.UInt32, self._row, i, active), dr.gather(mi.UInt32, self._row, i + 1, active)
+        at = lower_bound_within(self._sources, j, first, last, active)
+        found = active & (at < last) & (dr.gather(mi.UInt32, self._sources, at, active) == j)
         return dr.select(found, dr.gather(mi.UInt32, self.roots, at, found), NONE)
 
     def add_roots(self, i, j):
@@ -66,6 +69,13 @@ class Pairs:
         order = dr.argsort(keys)
         self.root_keys, self.roots = dr.gather(mi.UInt64, keys, order), dr.gather(mi.UInt32, roots, order)
         dr.eval(self.root_keys, self.roots)
+        self._index_rows()
+
+    def _index_rows(self):
+        """Note where the keys of each receiving patch begin, which makes searches short."""
+        self._sources = mi.UInt32(self.root_keys)
+        self._row = lower_bound(self.root_keys, mi.UInt64(dr.arange(mi.UInt32, self.elements.model.count + 1)) << 32)
+        dr.eval(self._sources, self._row)
 
     @dr.syntax
     def descend(self, pair, ui, vi, uj, vj, active=True):
@@ -74,10 +84,9 @@ class Pairs:
         e = self.elements
         child = dr.gather(mi.UInt32, self.child, pair, active)
         while child != 0:
-            receiver = dr.gather(mi.UInt32, self.receiver, pair)
-            of_receiver = dr.gather(mi.UInt32, self.receiver, child) != receiver
-            split = dr.select(of_receiver, receiver, dr.gather(mi.UInt32, self.source, pair))
-            pair = child + e.locate(split, dr.select(of_receiver, ui, uj), dr.select(of_receiver, vi, vj))
+            split = dr.gather(mi.UInt32, self.halved, pair)
+            of_receiver = (split & 1) == 1
+            pair = child + e.locate(split >> 1, dr.select(of_receiver, ui, uj), dr.select(of_receiver, vi, vj))
             child = dr.gather(mi.UInt32, self.child, pair)
         return pair
 
@@ -109,10 +118,12 @@ class Pairs:
         """F along S lines of each pair, stratified in all four dimensions (Float [pairs · lines])."""
         e, lines = self.elements, dr.opaque(mi.UInt32, self.lines)
         k = dr.arange(mi.UInt32, dr.width(pairs) * self.lines)
-        pair = dr.gather(mi.UInt32, pairs, k // lines)
-        i, j = dr.gather(mi.UInt32, self.receiver, pair), dr.gather(mi.UInt32, self.source, pair)
+        of = k // lines
+        i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
         key = hash_pair(dr.gather(mi.UInt32, e.key, i), dr.gather(mi.UInt32, e.key, j))
-        x0, x1, y0, y1 = kronecker(k % lines, key, self.seed)
+        x0, x1, y0, y1 = kronecker(k % lines, key, self.seed, of)
+        pair = dr.gather(mi.UInt32, pairs, of)
+        i, j = dr.gather(mi.UInt32, self.receiver, pair), dr.gather(mi.UInt32, self.source, pair)
         ui, vi = e.patch_point(i, *triangle(x0, x1))
         uj, vj = e.patch_point(j, *triangle(y0, y1))
         return e.model.kernel(dr.gather(mi.UInt32, e.patch, i), ui, vi, dr.gather(mi.UInt32, e.patch, j), uj, vj)
@@ -140,5 +151,6 @@ class Pairs:
         half = dr.gather(mi.UInt32, self.elements.child, split) + k % 4
         receiver, source = dr.gather(mi.UInt32, self.receiver, parent), dr.gather(mi.UInt32, self.source, parent)
         of_receiver = receiver == split
+        dr.scatter(self.halved, 2 * element + dr.select(element == dr.gather(mi.UInt32, self.receiver, chosen), mi.UInt32(1), 0), chosen)
         self._append(dr.select(of_receiver, half, receiver), dr.select(of_receiver, source, half))
-        dr.eval(self.receiver, self.source, self.child, self.sigma, self.partial)
+        dr.eval(self.receiver, self.source, self.child, self.halved, self.sigma, self.partial)

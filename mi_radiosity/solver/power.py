@@ -121,6 +121,7 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
     ray = dr.arange(mi.UInt32, count)
     key = opaque_index(seed)
     jitter = mi.sample_tea_float32(opaque_index(first), key ^ 0x5EED, ROUNDS)
+    dr.eval(jitter)
     spacing = dr.opaque(mi.Float64, whole / count)
     k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
     x0, x1, d0, d1 = kronecker(ray, opaque_index(first), key)
