@@ -9,7 +9,7 @@ from .power import RayRecord, distribute
 
 GROWTH = 0.25               # of the leaves may split in one wave,
 LEAST_SPLITS = 64           # or so many;
-REACH = 1 / 64              # and only in pairs with this share of the largest ρ σ B
+REACH = 1 / 16              # and only in pairs with this share of the largest ρ σ B
 RENEW = 4                   # pilot rays are cast anew when the mesh has grown by this factor
 PILOT_RAYS = 24             # per leaf, at least
 LEAST_PILOT = 1 << 16
