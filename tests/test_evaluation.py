@@ -12,7 +12,7 @@ from mi_radiosity.cli import main
 from mi_radiosity.evaluation import metrics
 from mi_radiosity.evaluation.bench import crossing
 from mi_radiosity.evaluation.compare import Cell, InProcess, compare_oracles, run_cells
-from mi_radiosity.evaluation.reference import Reference, render_reference
+from mi_radiosity.evaluation.reference import Reference, path_image, render_reference
 from mi_radiosity.evaluation.report import interval
 
 BOX = "scenes_xml/box_furnace.xml"
@@ -125,6 +125,13 @@ def test_foreign_and_damaged_references(tmp_path, cornell):
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(mr.RadiosityError, match="not a readable reference"):
         render_reference(scene, sensor, path, spp=1)
+
+
+def test_path_is_unbiased_at_few_samples():
+    """Four samples per pixel have the mean of many, whatever sampler the scene names."""
+    scene = mi.load_file("scenes_xml/office.xml")
+    few, many = (np.mean([path_image(scene, scene.sensors()[1], spp, seed).mean() for seed in range(2)]) for spp in (4, 25))
+    assert few == pytest.approx(many, rel=0.02)
 
 
 def test_reference_command(tmp_path, capsys):
