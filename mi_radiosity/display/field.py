@@ -3,7 +3,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..solver.arrays import ColorSums, concat, lower_bound, opaque_index, totals
+from ..solver.arrays import ColorSums, concat, lower_bound, opaque_index, totals, unique
 from ..solver.elements import child_at
 
 CORNERS = ((0., 0.), (1., 0.), (0., 1.))
@@ -88,7 +88,7 @@ class _Topology:
         parents = dr.compress(child != 0)
         if dr.width(parents) == 0:
             return mi.UInt32(), straight
-        table = _unique(concat(*(dr.gather(mi.UInt64, k, parents) for k in keys)))
+        table = unique(concat(*(dr.gather(mi.UInt64, k, parents) for k in keys)))
         middle = []
         for k, key in enumerate(keys):
             at = lower_bound(table, key)
@@ -112,7 +112,7 @@ class _Topology:
             if dr.width(bent):
                 m, a, b = (dr.gather(mi.UInt32, x, bent) for x in (m, a, b))
                 halves += [_side_keys(a, m), _side_keys(m, b)]
-        straight = _unique(concat(*halves)) if halves else mi.UInt64(0xFFFFFFFFFFFFFFFF)
+        straight = unique(concat(*halves)) if halves else mi.UInt64(0xFFFFFFFFFFFFFFFF)
         self.count += dr.width(table)
 
         # ---- Corners of the children ----
@@ -179,15 +179,6 @@ def _side_keys(a, b):
     return (mi.UInt64(dr.minimum(a, b)) << 32) | mi.UInt64(dr.maximum(a, b))
 
 
-def _unique(keys):
-    """Sorted keys without repetitions (UInt64)."""
-    keys = dr.sort(keys)
-    k = dr.arange(mi.UInt32, dr.width(keys))
-    keys = dr.gather(mi.UInt64, keys, dr.compress((k == 0) | (keys != dr.gather(mi.UInt64, keys, dr.maximum(k, 1) - 1))))
-    dr.eval(keys)
-    return keys
-
-
 def _weld(model):
     """One vertex number per corner of the patches (three UInt32 [patches]), and how many there are.
 
@@ -206,7 +197,7 @@ def _weld(model):
             key = _mix(key ^ mi.UInt64(mi.UInt32(mi.Int32(dr.floor(x * 256 + 0.37)))))
         keys.append(key)
     dr.eval(keys)
-    table = _unique(concat(*keys))
+    table = unique(concat(*keys))
     return [lower_bound(table, key) for key in keys], dr.width(table)
 
 

@@ -165,10 +165,6 @@ class Model:
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
         return digest.hexdigest()
 
-    def shape_of(self, patch):
-        """How messages call the shape that patch number ``patch`` belongs to."""
-        return self.faces.name(self.faces.shape[self._faces[patch]])
-
     # ---- Rays ----------------------------------------------------------------------------------
 
     def point(self, patch, u, v):

@@ -22,6 +22,15 @@ def concat(*arrays):
     return result
 
 
+def unique(keys):
+    """Sorted keys without repetitions (UInt64)."""
+    keys = dr.sort(keys)
+    k = dr.arange(mi.UInt32, dr.width(keys))
+    keys = dr.gather(mi.UInt64, keys, dr.compress((k == 0) | (keys != dr.gather(mi.UInt64, keys, dr.maximum(k, 1) - 1))))
+    dr.eval(keys)
+    return keys
+
+
 def lower_bound(values, key, active=True):
     """First position k of sorted ``values`` with values[k] >= key, at most the last one (UInt32 [n])."""
     low = dr.zeros(mi.UInt32, dr.width(key))

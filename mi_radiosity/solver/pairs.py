@@ -5,7 +5,7 @@ import mitsuba as mi
 from ..oracles import KernelSamples, Pair
 from ..scene.model import NONE
 from ..scene.sampling import hash_pair, kronecker, triangle
-from .arrays import concat, lower_bound, lower_bound_within, opaque_index
+from .arrays import concat, lower_bound, lower_bound_within, opaque_index, unique
 from .elements import MAX_LEVEL
 
 UNKNOWN = -1.0          # σ of a pair nobody has evaluated
@@ -59,10 +59,7 @@ class Pairs:
         """Make root pairs of patches (i, j) that have none (UInt32 [n], repetitions allowed)."""
         if dr.width(i) == 0:
             return
-        keys = dr.sort((mi.UInt64(i) << 32) | mi.UInt64(j))
-        n = dr.width(keys)
-        k = dr.arange(mi.UInt32, n)
-        keys = dr.gather(mi.UInt64, keys, dr.compress((k == 0) | (keys != dr.gather(mi.UInt64, keys, dr.maximum(k, 1) - 1))))
+        keys = unique((mi.UInt64(i) << 32) | mi.UInt64(j))
         fresh = opaque_index(len(self)) + dr.arange(mi.UInt32, dr.width(keys))
         self._append(mi.UInt32(keys >> 32), mi.UInt32(keys))
         keys, roots = concat(self.root_keys, keys), concat(self.roots, fresh)
