@@ -101,7 +101,7 @@ def leaf_corners(solution):
 
 
 def border_values(solution):
-    """Field values on the borders of all leaves at dyadic points: positions [n, 3], normals, values [n, 3]."""
+    """Field values on the borders of all leaves at dyadic points that are shown: positions [n, 3], normals, values [n, 3]."""
     e, model = solution.elements, solution.model
     leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
     level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
@@ -116,8 +116,10 @@ def border_values(solution):
     index = mi.UInt32(leaf)
     u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
     patch = dr.gather(mi.UInt32, e.patch, index)
-    values = np.array(mi_radiosity.display.Field(solution).at(index, u, v)).T
-    return np.array(model.point(patch, u, v)).T, np.array(dr.gather(mi.Vector3f, model.normal, patch)).T, values
+    shown = np.array(model.owns(patch, u, v)).astype(bool)
+    found = mi_radiosity.display.Field(solution).at(index, u, v), model.point(patch, u, v), dr.gather(mi.Vector3f, model.normal, patch)
+    values, points, normals = (np.array(x).T[shown] for x in found)
+    return points, normals, values
 
 
 def wall_means(solution):

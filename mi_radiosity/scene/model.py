@@ -199,6 +199,14 @@ class Model:
         patch = dr.gather(mi.UInt32, self._side_patch, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
         return Hit(valid, dr.select(valid, patch, NONE), u, v)
 
+    def owns(self, patch, u, v):
+        """Do points of patches belong to them, not to faces that lie on them (Bool [n])?"""
+        if not self.overlaps:
+            return dr.full(mi.Bool, True, dr.width(u))
+        face, back = dr.gather(mi.UInt32, self.face, patch), dr.gather(mi.Bool, self.back, patch)
+        owner, of_back, _, _ = self.overlaps.owner(face, back, u, v, dr.full(mi.Bool, True, dr.width(u)))
+        return (owner == face) & (of_back == back)
+
     def blocked(self, ray, active):
         """Does anything lie on the segments ``ray`` (Bool [n])?"""
         return self.tracing.ray_test(ray, active=active)
@@ -206,20 +214,20 @@ class Model:
     def kernel(self, i, ui, vi, j, uj, vj):
         """F(x, y) = V(x, y) cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n]).
 
-        Evaluated as unnormalised cosines over r⁴, and 0 where the points see each other's back.
+        Evaluated as unnormalised cosines over r⁴; 0 where the points see each other's back, or lie
+        under another face.
         """
         n_i, n_j = dr.gather(mi.Vector3f, self.normal, i), dr.gather(mi.Vector3f, self.normal, j)
         x, y = self.point(i, ui, vi), self.point(j, uj, vj)
         d = y - x
         r2 = dr.squared_norm(d)
         cosines = dr.maximum(dr.dot(n_i, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
-        faces = (cosines > 0) & (r2 > 0)
+        faces = (cosines > 0) & (r2 > 0) & self.owns(i, ui, vi) & self.owns(j, uj, vj)
         start = x + n_i * self._lift
         ray = mi.Ray3f(start + self.origin, (y + n_j * self._lift) - start)
         ray.maxt = 1 - 1e-5
         seen = faces & ~self.blocked(ray, faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
-
 
     def _connected(self, i, ui, vi, j, uj, vj):
         """Do points of patches see each other, each more than rounding above the plane of the other (Bool [n])?"""

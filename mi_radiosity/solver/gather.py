@@ -77,7 +77,7 @@ class Starved:
         """Reflected radiosity ρ H that cosine-distributed rays meet (Color3f [rays])."""
         e, model = self.elements, self.elements.model
         hit = model.trace(*model.leave(patch, u, v, s, t))
-        met = hit.patch != NONE
+        met = (hit.patch != NONE) & model.owns(patch, u, v)
         leaf = e.leaf_at(hit.patch, hit.u, hit.v, met)
         H = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaf, met)
         return dr.gather(mi.Color3f, e.reflectance, leaf, met) * H

@@ -140,9 +140,9 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
         receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
     n = len(elements)
     bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
-    # Rays that start inside a solid go nowhere; the others of their element carry their power.
+    # Rays that start inside a solid or under a face go nowhere; the others of their element carry their power.
     share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
-    starts = (share >= 1) | on_patch | ~hit.valid
+    starts = ((share >= 1) | on_patch | ~hit.valid) & model.owns(j, uj, vj)
     each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
     sums = ColorSums(n + 2, [4 * u for u in unshot])
     sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
