@@ -38,11 +38,17 @@ def rectangle(to_world=None, **parts):
 
 
 def leaf_values(solution, name="radiosity"):
-    """(values [leaves, 3], areas [leaves], patches [leaves]) of a solution's leaves as NumPy arrays."""
+    """(values [leaves, 3], open areas [leaves], patches [leaves]) of a solution's leaves as NumPy arrays."""
     leaves = np.flatnonzero(np.array(solution.elements.child) == 0)
     values = getattr(solution, name)
     values = np.array(values() if callable(values) else values).reshape(3, -1).T[leaves]
-    return values, np.array(solution.elements.area)[leaves], np.array(solution.elements.patch)[leaves]
+    return values, np.array(solution.elements.open_area)[leaves], np.array(solution.elements.patch)[leaves]
+
+
+def partition(solution):
+    """The area of the leaves of every patch [patches]."""
+    child, area, patch = (np.array(getattr(solution.elements, name)) for name in ("child", "area", "patch"))
+    return np.bincount(patch[child == 0], weights=area[child == 0], minlength=solution.model.count)
 
 
 def mesh(vertices, faces, bsdf=None, emitter=None, name=""):
@@ -101,7 +107,7 @@ def leaf_corners(solution):
 
 
 def border_values(solution):
-    """Field values on the borders of all leaves at dyadic points that are shown: positions [n, 3], normals, values [n, 3]."""
+    """Field values on the borders of all leaves at dyadic points that are shown: positions [n, 3], normals, values [n, 3], shapes [n]."""
     e, model = solution.elements, solution.model
     leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
     level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
@@ -119,16 +125,25 @@ def border_values(solution):
     shown = np.array(model.owns(patch, u, v)).astype(bool)
     found = mi_radiosity.display.Field(solution).at(index, u, v), model.point(patch, u, v), dr.gather(mi.Vector3f, model.normal, patch)
     values, points, normals = (np.array(x).T[shown] for x in found)
-    return points, normals, values
+    return points, normals, values, model.faces.shape[np.array(dr.gather(mi.UInt32, model.face, patch))[shown]]
+
+
+def gap_between_leaves(solution):
+    """Largest difference, relative to the brightest value, between leaves where they meet on one shape, and how often they do."""
+    points, normals, values, shapes = border_values(solution)
+    key = np.round(np.column_stack([points * 2 ** 14, normals * 100, shapes])).astype(np.int64)
+    _, group = np.unique(key, axis=0, return_inverse=True)
+    low, high = np.full((group.max() + 1, 3), np.inf), np.full((group.max() + 1, 3), -np.inf)
+    np.minimum.at(low, group.ravel(), values)
+    np.maximum.at(high, group.ravel(), values)
+    return (high - low).max() / max(values.max(), 1e-30), (np.bincount(group.ravel()) > 1).sum()
 
 
 def wall_means(solution):
     """Mean radiosity of every wall {number: [3]}; what lies inside solids counts as dark, as it does for others."""
     values, areas, patches = leaf_values(solution)
-    leaves = np.array(solution.elements.child) == 0
-    values = values * (np.array(solution.elements.open_area)[leaves] / areas)[:, None]
-    walls = names_of_walls(solution.model)
-    return {wall: np.average(values[walls[patches] == wall], axis=0, weights=areas[walls[patches] == wall]) for wall in np.unique(walls)}
+    walls, whole = names_of_walls(solution.model), np.array(solution.model.area)
+    return {wall: areas[walls[patches] == wall] @ values[walls[patches] == wall] / whole[walls == wall].sum() for wall in np.unique(walls)}
 
 
 def names_of_walls(model):

@@ -79,6 +79,37 @@ def rug():
     return scene(lamp=ceiling(), floor=quad(SQUARE, bsdf=diffuse(FLOOR)), rug=quad(SQUARE * [.5, .5, 1], bsdf=diffuse(OTHER))), check
 
 
+def crossing_rugs():
+    """Two plates that cross each other in the floor's plane are lit as if they lay on it, the smaller on top."""
+    def parts(lift):
+        turn = T().rotate([0, 0, 1], 30)
+        return scene(lamp=ceiling(), floor=quad(SQUARE, bsdf=diffuse(FLOOR)),
+                     large=rectangle(T().translate([.2, .1, lift]) @ turn @ T().scale([.6, .3, 1]), bsdf=diffuse(OTHER)),
+                     small=rectangle(T().translate([0, .3, 2 * lift]).scale([.3, .4, 1]), bsdf=diffuse(WALL)))
+    def check(solution):
+        reference = mr.solve(parts(1e-4), elements=2500, rays=1_000_000)
+        for rho in (FLOOR, OTHER, WALL):
+            assert mean(solution, rho) == pytest.approx(mean(reference, rho), rel=.015)
+            assert shown_area(solution, rho) == pytest.approx(shown_area(reference, rho), rel=.015)
+        assert shown_area(solution, WALL) == pytest.approx(.48, rel=1e-4)
+    return parts(0), check
+
+
+def shown_area(solution, reflectance):
+    _, areas, patches = leaf_values(solution)
+    return areas[np.isin(patches, group(solution.model, reflectance))].sum()
+
+
+def crossing_lamps():
+    """Two lamps of 4 m² in the ceiling that share 1 m² shine as one of 7 m²."""
+    def down(x): return T().translate([x, x, 5]).rotate([1, 0, 0], 180)
+    lamps = {name: rectangle(down(x), bsdf=diffuse(WALL), emitter=lamp()) for name, x in (("one", 0), ("two", 1))}
+    def check(solution):
+        assert solution.stats["power"]["emitted"] / 3 == pytest.approx(7, rel=.01)
+        closed_room_is_right(7, 600)(solution)
+    return scene(room=room(), **lamps), check
+
+
 def lamp_in_ceiling():
     """A lamp in the plane of the ceiling gives all its light to the room."""
     down = T().translate([0, 0, 5]).rotate([1, 0, 0], 180)
@@ -185,7 +216,8 @@ def ball_is_lit(solution):
 CASES = {"degenerate faces": with_degenerate_faces, "slivers": slivers, "duplicate": coincident(quad(SQUARE, bsdf=diffuse(FLOOR))),
          "duplicate, other diagonal": coincident(quad(np.roll(SQUARE, 1, axis=0), bsdf=diffuse(FLOOR))),
          "duplicate, turned faces": coincident(mesh(SQUARE, [[1, 2, 0], [2, 3, 0]], diffuse(FLOOR))),
-         "back to back": coincident(quad(SQUARE[::-1], bsdf=diffuse(OTHER))), "rug in the floor": rug, "lamp in the ceiling": lamp_in_ceiling,
+         "back to back": coincident(quad(SQUARE[::-1], bsdf=diffuse(OTHER))), "rug in the floor": rug, "crossing rugs": crossing_rugs, "crossing lamps": crossing_lamps,
+         "lamp in the ceiling": lamp_in_ceiling,
          "interpenetrating boxes": interpenetrating_boxes, "thin wall": thin_wall, "dark room": dark_room,
          "open": open_scene, "tiny lamp": tiny_lamp, "10,000 lamps": many_lamps, "rho 0": furnace(0.0), "rho 0.999": furnace(0.999),
          "mirrored": transformed(T().scale([1, -1, 1])), "mirrored thrice": transformed(T().scale([-1, -1, -1])), "tiny units": transformed(T().scale(1e-6)),

@@ -39,22 +39,31 @@ def transformed_box(scale, move):
                  plate=rectangle(place @ T().translate([-.3, .2, -.4]).scale(.4), bsdf=diffuse(.3, two_sided=True)))
 
 
-@pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (7.3, 0), (1e3, 1e4), (100, 1e4)], ids=str)
-def test_scale_and_place_do_not_matter(scale, move):
-    """Scaled: the same leaves. Moved: of a hundred leaves 85 at least, as a ray that rounding sends elsewhere changes what is known of B. Means to 1 %."""
-    reference, other = (mr.solve(transformed_box(*how), elements=2000, rays=1_000_000) for how in ((1, [0, 0, 0]), (scale, [move, -move, move])))
+PLACES = [(1e-3, 0), (1e3, 0), (7.3, 0), (1e3, 1e4), (100, 1e4), (1, 1e4)]
+
+
+def rounded_corners(scale, move):
+    """By how much of the room float32 rounds the corners the solver is given: by 5e-4 of the smallest room."""
+    return np.spacing(np.float32(move)) / 2 / scale
+
+
+@pytest.mark.parametrize("oracle, kept", [(mr.GMI(), .985), (mr.KS(), .95)], ids=str)
+@pytest.mark.parametrize("scale, move", PLACES, ids=str)
+def test_scale_and_place_do_not_matter(scale, move, oracle, kept):
+    """The same leaves but those that hang on a single ray: 98.5 % for GMI, 95 % for KS with its heavy tail, 80 % where the file itself moves corners. Means to 1 %."""
+    reference, other = (mr.solve(transformed_box(*how), oracle, elements=2000, rays=1_000_000) for how in ((1, [0, 0, 0]), (scale, [move, -move, move])))
     def leaves(solution, scale):
         corners = (leaf_corners(solution) - solution.model.centre) / scale
         return np.column_stack([corners.mean(axis=1), np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)])
     distance, _ = cKDTree(leaves(reference, 1)).query(leaves(other, scale))
-    assert (distance < 5e-3).mean() > (.85 if move else .99)
+    assert (distance < 5e-3).mean() > (kept if rounded_corners(scale, move) < 1e-5 else .8)
     values = [solution.radiosity() for solution in (reference, other)]
     means = [np.average(np.array(v)[0, :s.model.count], weights=np.array(s.model.area)) for v, s in zip(values, (reference, other))]
     assert means[1] == pytest.approx(means[0], rel=.01)
 
 
-@pytest.mark.parametrize("scale, move", [(1e-3, 0), (1e3, 0), (1, 1e4), (1e3, 1e4)], ids=str)
+@pytest.mark.parametrize("scale, move", PLACES, ids=str)
 def test_an_epsilon_means_the_same_mesh_anywhere(scale, move):
-    """σ of GMI has no unit: at one ε the mesh has the same number of elements, to 1 %; 2 % where corners are rounded to 1e-3 of the room."""
+    """σ of GMI has no unit: at one ε the mesh has the same number of elements, to 1 %; 2 % where the file itself moves corners."""
     counts = [mr.solve(transformed_box(*how), epsilon=3e-7, rays=10_000).stats["elements"] for how in ((1, [0, 0, 0]), (scale, [move, -move, move]))]
-    assert counts[0] > 300 and counts[1] == pytest.approx(counts[0], rel=.02 if move > scale * 100 else .01)
+    assert counts[0] > 300 and counts[1] == pytest.approx(counts[0], rel=.01 if rounded_corners(scale, move) < 1e-5 else .02)

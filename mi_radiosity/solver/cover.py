@@ -36,7 +36,7 @@ def _covered_share(elements, leaves, points, seed):
     model, each = elements.model, opaque_index(points)
     k = dr.arange(mi.UInt32, dr.width(leaves) * points)
     leaf = dr.gather(mi.UInt32, leaves, k // each)
-    x0, x1, s, t = kronecker(k % each, dr.gather(mi.UInt32, elements.key, leaves), opaque_index(seed ^ 0xC0), k // each)
+    x0, x1, s, t = kronecker(k % each, elements.key(leaves), opaque_index(seed ^ 0xC0), k // each)
     patch, (u, v) = dr.gather(mi.UInt32, elements.patch, leaf), elements.patch_point(leaf, *triangle(x0, x1))
     normal, lamp = dr.gather(mi.Vector3f, model.normal, patch), dr.max(dr.gather(mi.Color3f, model.emission, patch)) > 0
     origin, aside = model.leave(patch, u, v, s, t)

@@ -5,7 +5,7 @@ import mitsuba as mi
 from ..scene.sampling import hash_pair
 from .arrays import concat, opaque_index
 
-MAX_LEVEL = 14      # below it float32 barycentric coordinates get too coarse
+MAX_LEVEL = 14      # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
 
 
 class Elements:
@@ -15,8 +15,8 @@ class Elements:
     s = ±2^(−level), negative for the middle child of four, which stands upside down.
 
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
-    children, 0 for leaves; UInt32), ``key`` (UInt32, what random numbers are drawn by: it depends on
-    the element alone, not on what else was split before), ``u0``, ``v0``, ``scale`` (Float), ``area``
+    children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
+    way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale`` (Float), ``area``
     and ``open_area`` (Float, m²; the second without what lies inside solids, see `find_covered`),
     ``reflectance`` (Color3f, the mean over the element).
     """
@@ -27,7 +27,7 @@ class Elements:
         self.patch = dr.arange(mi.UInt32, n)
         self.parent = dr.arange(mi.UInt32, n)
         self.child = dr.zeros(mi.UInt32, n)
-        self.key = dr.arange(mi.UInt32, n)
+        self.place = dr.zeros(mi.UInt32, n)
         self.u0, self.v0 = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.scale = dr.full(mi.Float, 1, n)
         self.area = self.open_area = mi.Float(model.area)
@@ -38,8 +38,14 @@ class Elements:
         return dr.width(self.patch)
 
     def leaf_indices(self):
-        """Numbers of the leaves (UInt32 [leaves])."""
-        return dr.compress(self.child == 0)
+        """Numbers of the leaves (UInt32 [leaves]), neighbours after neighbours, whichever was split first."""
+        leaves = dr.compress(self.child == 0)
+        patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
+        return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
+
+    def key(self, element):
+        """What random numbers of elements are drawn by: the same whatever else was split (UInt32 [n])."""
+        return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
     def split(self, chosen):
         """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
@@ -61,13 +67,14 @@ class Elements:
         self.patch = concat(self.patch, patch)
         self.parent = concat(self.parent, parent)
         self.child = concat(self.child, dr.zeros(mi.UInt32, 4 * count))
-        self.key = concat(self.key, hash_pair(dr.gather(mi.UInt32, self.key, parent), which + 1))
+        place = dr.gather(mi.UInt32, self.place, parent)
+        self.place = concat(self.place, place + 1 + (which << (2 + 2 * (MAX_LEVEL - (place & 15)))))
         self.u0, self.v0 = concat(self.u0, u0), concat(self.v0, v0)
         self.scale = concat(self.scale, scale)
         self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * .25)
         self.reflectance = concat(self.reflectance, reflectance)
         self.leaves += 3 * count
-        dr.eval(self.patch, self.parent, self.child, self.key, self.u0, self.v0, self.scale, self.area, self.reflectance)
+        dr.eval(self.patch, self.parent, self.child, self.place, self.u0, self.v0, self.scale, self.area, self.reflectance)
 
     def _mean_reflectance(self, patch, u0, v0, scale):
         """ρ averaged over four points of each element (Color3f)."""

@@ -41,8 +41,9 @@ class Starved:
         e, k = self.elements, dr.arange(mi.UInt32, self.rays // 2)
         each = opaque_index(self.samples)
         leaf, line = dr.gather(mi.UInt32, self.leaves, k // each), k % each
-        key = dr.gather(mi.UInt32, e.key, leaf)
-        x0, x1, s, t = kronecker(line, dr.gather(mi.UInt32, e.key, self.leaves), self.seed, k // each)
+        keys = e.key(self.leaves)
+        key = dr.gather(mi.UInt32, keys, k // each)
+        x0, x1, s, t = kronecker(line, keys, self.seed, k // each)
         patch = dr.gather(mi.UInt32, e.patch, leaf)
         u, v = e.patch_point(leaf, *triangle(x0, x1))
         direct = self._from_lamps(patch, u, v, line, key, s, t)

@@ -117,7 +117,7 @@ class Pairs:
         k = dr.arange(mi.UInt32, dr.width(pairs) * self.lines)
         of = k // lines
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        key = hash_pair(dr.gather(mi.UInt32, e.key, i), dr.gather(mi.UInt32, e.key, j))
+        key = hash_pair(e.key(i), e.key(j))
         x0, x1, y0, y1 = kronecker(k % lines, key, self.seed, of)
         pair = dr.gather(mi.UInt32, pairs, of)
         i, j = dr.gather(mi.UInt32, self.receiver, pair), dr.gather(mi.UInt32, self.source, pair)

@@ -5,7 +5,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import ROUNDS, kronecker, triangle
+from ..scene.sampling import ROUNDS, hash_pair, kronecker, triangle
 from .arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
 
 TAIL = 0.01             # share of the power below which the rest is summed in closed form
@@ -75,7 +75,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     while left > 0 and sum(unshot) > 0:
         last = flow.iterations > 0 and (flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted))
         count = left if last else min(left, max(64, round(left * share)))
-        sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, rays - left, seed, record is not None)
+        sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, record is not None)
         if record is not None:
             record.append(rays_seen)
         left -= count
@@ -104,7 +104,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     return flow
 
 
-def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
+def _shoot(pairs, leaves, power, unshot, count, iteration, seed, pilot):
     """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
 
     Returns the sums per element, followed by two bins for power that escapes and that is blocked,
@@ -120,12 +120,19 @@ def _shoot(pairs, leaves, power, unshot, count, first, seed, pilot):
 
     ray = dr.arange(mi.UInt32, count)
     key = opaque_index(seed)
-    jitter = mi.sample_tea_float32(opaque_index(first), key ^ 0x5EED, ROUNDS)
+    jitter = mi.sample_tea_float32(opaque_index(iteration), key ^ 0x5EED, ROUNDS)
     dr.eval(jitter)
     spacing = dr.opaque(mi.Float64, whole / count)
     k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
-    x0, x1, d0, d1 = kronecker(ray, opaque_index(first), key)
     source = dr.gather(mi.UInt32, leaves, k)
+    if pilot:
+        # Numbered within their leaf, so that what happens elsewhere leaves the mesh here alone.
+        start = mi.Float64(dr.gather(mi.UInt64, cumulative, k) - dr.gather(mi.UInt64, weight, k)) / spacing - jitter
+        number, owner = ray - mi.UInt32(dr.maximum(dr.ceil(start), 0)), elements.key(leaves)
+        x0, x1, d0, d1 = kronecker(number, owner, key ^ hash_pair(opaque_index(iteration), key), k)
+    else:
+        # Numbered through: rays of neighbouring leaves are well spread among each other.
+        x0, x1, d0, d1 = kronecker(ray, opaque_index(iteration), key)
     j = dr.gather(mi.UInt32, elements.patch, source)
     uj, vj = elements.patch_point(source, *triangle(x0, x1))
     hit = model.trace(*model.leave(j, uj, vj, d0, d1))

@@ -1,4 +1,6 @@
 """Refinement: from patches to a mesh, worst pairs first."""
+import math
+
 import drjit as dr
 import mitsuba as mi
 
@@ -7,9 +9,9 @@ from ..scene.model import NONE
 from .arrays import concat
 from .power import RayRecord, distribute
 
-GROWTH = 0.25               # of the leaves may split in one wave,
-LEAST_SPLITS = 64           # or so many;
-REACH = 1 / 16              # and only in pairs with this share of the largest ρ σ B
+GROWTH = 0.1                # of the leaves may split in one wave,
+LEAST_SPLITS = 64           # or so many
+STEP = 1 / 4                # by which the level comes down, above which pairs split
 RENEW = 4                   # pilot rays are cast anew when the mesh has grown by this factor
 PILOT_RAYS = 24             # per leaf, at least
 LEAST_PILOT = 1 << 16
@@ -34,26 +36,24 @@ class Refinement:
         self.pairs, self.elements, self.oracle = pairs, pairs.elements, pairs.oracle
         self.wanted, self.floor, self.exact = elements, epsilon, exact
         self.seed, self.progress = seed, progress
-        self.epsilon = epsilon or 0.0
+        self.epsilon, self.level = epsilon or 0.0, math.inf
         self.rays, self.pilots, self.first_share = 0, 0, 0.5
 
     def run(self):
         """Refine until the mesh has the wanted size, or no pair is worse than ε."""
         self._pilot()
-        renewed = self.elements.leaves
         while True:
             fresh = self._ask()
             pairs, value, element = self._candidates()
-            room = self._room() if dr.width(pairs) else 0
+            room = min(self._room(), self._until_pilot()) if dr.width(pairs) else 0
             split = self._split_elements(value, element, room) if room else 0
             if dr.width(pairs):
                 split += self._split_pairs(pairs, value, element)
             self.progress(self.elements.leaves)
             if not fresh and not split:
                 break
-            if self.elements.leaves >= RENEW * renewed and self._room():
+            if not self._until_pilot() and self._room():
                 self._pilot()
-                renewed = self.elements.leaves
         if self.wanted is not None and self._room() and self.exact:
             raise RadiosityError(f"the oracle '{self.oracle}' finds nothing left to refine at {self.elements.leaves} elements: "
                                  f"ask for fewer than {self.wanted} --elements, or give --epsilon instead")
@@ -62,10 +62,15 @@ class Refinement:
         """How many more elements may split."""
         return 1 << 30 if self.wanted is None else (self.wanted - self.elements.leaves) // 3
 
+    def _until_pilot(self):
+        """How many more elements may split before pilot rays are cast anew, at the same size of every mesh."""
+        return (RENEW * self.piloted - self.elements.leaves) // 3
+
     # ---- Rays ----------------------------------------------------------------------------------
 
     def _pilot(self):
         """Cast new pilot rays; they replace the old ones, and so does the radiosity they carry."""
+        self.piloted = self.elements.leaves
         rays = min(max(PILOT_RAYS * self.elements.leaves, LEAST_PILOT), MOST_PILOT)
         record = []
         # Each pilot draws from a stream of its own, and none from the final one's.
@@ -125,7 +130,9 @@ class Refinement:
         dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE, mode=dr.ReduceMode.Local)
         worst = dr.reinterpret_array(mi.Float, worst)
         peak = dr.max(value)[0]
-        least = max(self.floor or 0.0, REACH * peak)
+        if peak < self.level:
+            self.level = max(self.floor or 0.0, STEP * peak)
+        least = self.level
         leaves = dr.compress((e.child == 0) & (worst > 0) & (worst >= dr.opaque(mi.Float, least)))
         count = min(dr.width(leaves), max(LEAST_SPLITS, round(GROWTH * e.leaves)), room)
         self.epsilon = least

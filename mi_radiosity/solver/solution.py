@@ -12,8 +12,8 @@ from ..scene import Model
 from ..scene.faces import owned
 from .elements import Elements
 
-FORMAT = 1
-TREE = ("patch", "parent", "child", "key", "u0", "v0", "scale", "open_area")
+FORMAT = 2
+TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale", "open_area")
 COLORS = ("reflectance", "direct", "indirect")
 
 
