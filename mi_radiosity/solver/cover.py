@@ -6,6 +6,7 @@ from ..scene.model import NONE
 from ..scene.sampling import cosine_direction, kronecker, triangle
 from .arrays import ColorSums, opaque_index
 
+INSET = 2.0 ** -12          # of an element: how far from its sides it is searched for walls
 GLANCE, LOOK = 8, 64        # points per leaf: of all leaves, and of those with a covered point
 LEAST = 1 / 128             # no open share is smaller, so that nothing divides by zero
 
@@ -29,6 +30,25 @@ def find_covered(elements, seed):
     elements.add_to_ancestors(sums, leaves, [area, mi.Float64(0), mi.Float64(0)])
     elements.open_area = mi.Float(sums.gather(dr.arange(mi.UInt32, len(elements)))[0])
     dr.eval(elements.open_area)
+
+
+def find_divided(elements):
+    """Set ``elements.divided``: does a wall stand across a leaf, or across one below an element (Bool [elements])?
+
+    What crosses a triangle crosses two of its sides, so lines just above the sides find it.
+    """
+    model, leaves = elements.model, elements.leaf_indices()
+    patch = dr.gather(mi.UInt32, elements.patch, leaves)
+    lift = dr.gather(mi.Vector3f, model.normal, patch) * model.offset
+    corners = [model.point(patch, *elements.patch_point(leaves, a, b)) + lift
+               for a, b in ((INSET, INSET), (1 - 2 * INSET, INSET), (INSET, 1 - 2 * INSET))]
+    divided = dr.full(mi.Bool, False, dr.width(leaves))
+    for a, b in zip(corners, corners[1:] + corners[:1]):
+        ray = mi.Ray3f(a + model.origin, b - a)
+        ray.maxt = 1
+        divided |= model.blocked(ray, ~divided)
+    elements.divided = dr.zeros(mi.Bool, len(elements))
+    elements.mark_ancestors(elements.divided, dr.gather(mi.UInt32, leaves, dr.compress(divided)))
 
 
 def _covered_share(elements, leaves, points, seed):

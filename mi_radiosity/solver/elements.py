@@ -17,8 +17,8 @@ class Elements:
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
     way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale`` (Float), ``area``
-    and ``open_area`` (Float, m²; the second without what lies inside solids, see `find_covered`),
-    ``reflectance`` (Color3f, the mean over the element).
+    and ``open_area`` (Float, m²; the second without what is covered, see `find_covered`),
+    ``reflectance`` (Color3f, the mean over the element), ``divided`` (Bool, see `find_divided`).
     """
 
     def __init__(self, model):
@@ -32,6 +32,7 @@ class Elements:
         self.scale = dr.full(mi.Float, 1, n)
         self.area = self.open_area = mi.Float(model.area)
         self.reflectance = mi.Color3f(model.reflectance)
+        self.divided = dr.zeros(mi.Bool, n)
         self.leaves = n
 
     def __len__(self):
@@ -108,6 +109,17 @@ class Elements:
         climbing = dr.full(mi.Bool, True, dr.width(leaves))
         while climbing:
             sums.add(power, element, climbing)
+            parent = dr.gather(mi.UInt32, self.parent, element)
+            climbing = parent != element
+            element = parent
+
+    @dr.syntax
+    def mark_ancestors(self, marks, elements):
+        """Set ``marks`` (Bool [elements]) of elements and of all their ancestors."""
+        element = mi.UInt32(elements)
+        climbing = dr.full(mi.Bool, True, dr.width(elements))
+        while climbing:
+            dr.scatter(marks, True, element, climbing)
             parent = dr.gather(mi.UInt32, self.parent, element)
             climbing = parent != element
             element = parent

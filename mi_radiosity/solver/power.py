@@ -50,7 +50,8 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     the power ρ H_(k−1) A that is unshot, with rays in proportion to it: systematic over the
     elements, cosine-distributed, low-discrepancy in position and direction. A ray leaves its power
     at the receiver of the first pair without children on its way down; where nobody has evaluated
-    that pair, or something stands between the two, at the leaf it meets: no light behind walls.
+    that pair, something stands between the two, or a wall stands on the receiver, at the leaf it
+    meets. Leaves that a wall divides send light from where it came down: no light behind walls.
 
     The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration,
     every later one takes 1 − λ of the rays left, so that all rays carry about the same power. Once
@@ -71,12 +72,14 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
 
     flow = Flow()
     unshot = flow.emitted = totals(power)
-    share, left, shot = first_share, rays, 0.0
+    share, left, shot, seats = first_share, rays, 0.0, None
     while left > 0 and sum(unshot) > 0:
         last = flow.iterations > 0 and (flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted))
         count = left if last else min(left, max(64, round(left * share)))
-        sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, record is not None)
-        if record is not None:
+        if record is None:
+            sums, seats = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, seats)
+        else:
+            sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, pilot=True)
             record.append(rays_seen)
         left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
@@ -104,11 +107,12 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     return flow
 
 
-def _shoot(pairs, leaves, power, unshot, count, iteration, seed, pilot):
+def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pilot=False):
     """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
 
     Returns the sums per element, followed by two bins for power that escapes and that is blocked,
-    and the RayRecord if ``pilot``.
+    and the RayRecord if ``pilot``, else the seats for the next iteration: of every divided leaf the
+    patch point where one of its rays came down, drawn at random (two Float [elements]).
     """
     elements, model = pairs.elements, pairs.elements.model
     # Integer weights: the distribution is the same on any number of threads.
@@ -135,6 +139,9 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, pilot):
         x0, x1, d0, d1 = kronecker(ray, opaque_index(iteration), key)
     j = dr.gather(mi.UInt32, elements.patch, source)
     uj, vj = elements.patch_point(source, *triangle(x0, x1))
+    seated = dr.gather(mi.Bool, elements.divided, source) if seats else dr.full(mi.Bool, False, count)
+    if seats:
+        uj, vj = (dr.select(seated, dr.gather(mi.Float, seat, source, seated), x) for seat, x in zip(seats, (uj, vj)))
     hit = model.trace(*model.leave(j, uj, vj, d0, d1))
 
     on_patch = hit.patch != NONE
@@ -144,20 +151,38 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, pilot):
     receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
     if not pilot:
         vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0) & ~dr.gather(mi.Bool, pairs.partial, pair, known)
+        vetted &= ~dr.gather(mi.Bool, elements.divided, receiver, known)
         receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
     n = len(elements)
     bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
     # Rays that start inside a solid or under a face go nowhere; the others of their element carry their power.
     share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
+    share = dr.select(seated, 1, share)
     starts = ((share >= 1) | on_patch | ~hit.valid) & model.owns(j, uj, vj)
     each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
     sums = ColorSums(n + 2, [4 * u for u in unshot])
     sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
-    record = None
-    if pilot:
-        record = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
-        dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
+    if not pilot:
+        return sums, _seats(elements, receiver, hit, on_patch & dr.gather(mi.Bool, elements.divided, receiver, on_patch))
+    record = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
+    dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
     return sums, record
+
+
+def _seats(elements, leaf, hit, active):
+    """Of each leaf one of the points that ``active`` rays meet it at (two Float [elements])."""
+    # The least of well mixed numbers: any of them, but the same on any number of threads.
+    lot = mi.UInt64(hash_pair(dr.arange(mi.UInt32, dr.width(leaf)), 0)) << 32 | mi.UInt64(dr.arange(mi.UInt32, dr.width(leaf)))
+    least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, len(elements))
+    dr.scatter_reduce(dr.ReduceOp.Min, least, lot, leaf, active)
+    drawn = active & (dr.gather(mi.UInt64, least, leaf, active) == lot)
+    seats = []
+    for x in (hit.u, hit.v):
+        seat = dr.zeros(mi.Float, len(elements))
+        dr.scatter(seat, x, leaf, drawn)
+        seats.append(seat)
+    dr.eval(seats)
+    return seats
 
 
 def _push(elements, sums, leaves, scale):

@@ -8,7 +8,7 @@ from ..errors import RadiosityError, interruptible
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from .arrays import totals
-from .cover import find_covered
+from .cover import find_covered, find_divided
 from .elements import Elements
 from .gather import Starved
 from .pairs import Pairs
@@ -65,6 +65,7 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
     refinement = Refinement(pairs, elements, epsilon, seed & 0xFFFFFFFF, lambda done: report("refine", done, elements), exact)
     refinement.run()
     find_covered(tree, seed & 0xFFFFFFFF)
+    find_divided(tree)
     seconds["refine"] = lap()
 
     rays = int(rays or RAYS_PER_ELEMENT * tree.leaves)
