@@ -4,6 +4,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from mi_radiosity.solver.cover import is_covered
+
 mi.set_variant("llvm_ad_rgb")
 mi.set_log_level(mi.LogLevel.Error)
 
@@ -122,21 +124,21 @@ def border_values(solution):
     index = mi.UInt32(leaf)
     u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
     patch = dr.gather(mi.UInt32, e.patch, index)
-    shown = np.array(model.owns(patch, u, v)).astype(bool)
+    shown = ~np.array(is_covered(e, index, u, v)).astype(bool)
     found = mi_radiosity.display.Field(solution).at(index, u, v), model.point(patch, u, v), dr.gather(mi.Vector3f, model.normal, patch)
     values, points, normals = (np.array(x).T[shown] for x in found)
     return points, normals, values, model.faces.shape[np.array(dr.gather(mi.UInt32, model.face, patch))[shown]]
 
 
-def gap_between_leaves(solution):
-    """Largest difference, relative to the brightest value, between leaves where they meet on one shape, and how often they do."""
+def gaps_between_leaves(solution):
+    """Differences, relative to the brightest value, between leaves where they meet on one shape [places]."""
     points, normals, values, shapes = border_values(solution)
     key = np.round(np.column_stack([points * 2 ** 14, normals * 100, shapes])).astype(np.int64)
     _, group = np.unique(key, axis=0, return_inverse=True)
     low, high = np.full((group.max() + 1, 3), np.inf), np.full((group.max() + 1, 3), -np.inf)
     np.minimum.at(low, group.ravel(), values)
     np.maximum.at(high, group.ravel(), values)
-    return (high - low).max() / max(values.max(), 1e-30), (np.bincount(group.ravel()) > 1).sum()
+    return (high - low).max(axis=1)[np.bincount(group.ravel()) > 1] / max(values.max(), 1e-30)
 
 
 def wall_means(solution):

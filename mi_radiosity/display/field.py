@@ -4,9 +4,9 @@ import mitsuba as mi
 
 from ..scene.model import NONE
 from ..solver.arrays import ColorSums, concat, lower_bound, opaque_index, totals, unique
-from ..solver.elements import child_at
+from ..solver.elements import NODES, child_at
 
-CORNERS = ((0., 0.), (1., 0.), (0., 1.))
+FAINT = 1e-4            # weight below which a node has no say
 SHARPEN = 1             # rounds in which vertices make up for what averaging took from the elements
 
 
@@ -21,6 +21,8 @@ class Field:
     split bends at the middle vertex, another is straight. Where the neighbour is finer still, its
     vertices between the nodes lie on the straight line between them. So no side shows a crack.
 
+    Where a wall stands on a leaf, each side of it is shown by the nodes on that side alone.
+
     nodes: six Color3f per element, [6 · elements]; 0…2 corners, 3…5 the middles opposite them.
     """
 
@@ -28,16 +30,22 @@ class Field:
         self.elements = solution.elements
         self.flat = solution.irradiance()
         leaves = self.elements.leaf_indices()
-        mesh = _Topology(self.elements, leaves)
         H = dr.gather(mi.Color3f, self.flat, leaves)
+        mesh = _Topology(self.elements, leaves)
         values = mesh.spread(H)
         for _ in range(SHARPEN):
-            values = dr.maximum(values + mesh.spread(H - mesh.mean(values)), 0)
+            lost = dr.select(dr.gather(mi.UInt32, self.elements.across, leaves) == 0, H - mesh.mean(values), 0)
+            values = dr.maximum(values + mesh.spread(lost), 0)
         values = mesh.straighten(values)
         self.nodes = dr.zeros(mi.Color3f, 6 * len(self.elements))
         for k, color in enumerate(mesh.node_values(values)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
-        dr.eval(self.nodes)
+        self.points, self.walled = dr.zeros(mi.Point3f, 6 * len(self.elements)), dr.zeros(mi.Bool, len(self.elements))
+        points = mesh.node_points()
+        for k, point in enumerate(points):
+            dr.scatter(self.points, point, 6 * leaves + k)
+        dr.scatter(self.walled, mesh.find_walls(points), leaves)
+        dr.eval(self.nodes, self.points, self.walled)
 
     def at(self, leaf, u, v, active=True):
         """H at patch points (u, v) on leaves (Color3f [n])."""
@@ -51,9 +59,16 @@ class Field:
         middle = quarter == 3
         a = dr.select(middle, 1 - 2 * a, 2 * a - dr.select(quarter == 1, 1., 0.))
         b = dr.select(middle, 1 - 2 * b, 2 * b - dr.select(quarter == 2, 1., 0.))
-        def pick(*nodes): return dr.select(quarter == 0, mi.UInt32(nodes[0]), dr.select(quarter == 1, mi.UInt32(nodes[1]), dr.select(quarter == 2, mi.UInt32(nodes[2]), mi.UInt32(nodes[3]))))
-        def value(node): return dr.gather(mi.Color3f, self.nodes, 6 * leaf + node, active)
-        return value(pick(0, 5, 4, 3)) * (1 - a - b) + value(pick(5, 1, 3, 4)) * a + value(pick(4, 3, 2, 5)) * b
+        def pick(kind, choices): return dr.select(quarter == 0, kind(choices[0]), dr.select(quarter == 1, kind(choices[1]), dr.select(quarter == 2, kind(choices[2]), kind(choices[3]))))
+        walled = active & dr.gather(mi.Bool, self.walled, leaf, active)
+        x = e.model.above(dr.gather(mi.UInt32, e.patch, leaf, active), u, v)
+        total, seen, weights = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
+        for nodes, weight in (((0, 5, 4, 3), 1 - a - b), ((5, 1, 3, 4), a), ((4, 3, 2, 5), b)):
+            value = dr.gather(mi.Color3f, self.nodes, 6 * leaf + pick(mi.UInt32, nodes), active)
+            hidden = e.model.blocked(x, dr.gather(mi.Point3f, self.points, 6 * leaf + pick(mi.UInt32, nodes), walled), walled)
+            total, seen = total + value * weight, seen + dr.select(hidden, 0, value * weight)
+            weights += dr.select(hidden, 0, weight)
+        return dr.select(walled & (weights > FAINT), seen / weights, total)
 
 
 class _Topology:
@@ -77,6 +92,18 @@ class _Topology:
         straight = mi.UInt64(0xFFFFFFFFFFFFFFFF)        # sides that must not bend, as sorted keys
         while dr.width(level):
             level, straight = self._next_level(level, straight)
+        self._place_vertices()
+
+    def _place_vertices(self):
+        """Where vertices are, just inside of the first element that has them (Point3f [vertices])."""
+        e, every = self.elements, dr.arange(mi.UInt32, len(self.elements))
+        self._point, first = dr.zeros(mi.Point3f, self.count), dr.full(mi.UInt32, NONE, self.count)
+        for corner in self.corner:
+            dr.scatter_reduce(dr.ReduceOp.Min, first, every, corner)
+        for corner, place in zip(self.corner, NODES):
+            point = e.model.above(e.patch, *e.node_point(every, *place))
+            dr.scatter(self._point, point, corner, dr.gather(mi.UInt32, first, corner) == every)
+        dr.eval(self._point)
 
     def _next_level(self, level, straight):
         """Number the middle vertices of the elements ``level``; returns their children and straight sides."""
@@ -129,7 +156,7 @@ class _Topology:
         """Vertex values from leaf values: averages over the leaves around (Color3f [vertices]).
 
         A leaf counts by its angle at the vertex over its size, which is right for linear fields next
-        to a hanging vertex, and by the share of it that can be seen.
+        to a hanging vertex, and by the share of it that can be seen; not at all at vertices across a wall.
         """
         e = self.elements
         patch = dr.gather(mi.UInt32, e.patch, self.leaves)
@@ -137,12 +164,13 @@ class _Topology:
         sides = (e1, e2), (e2 - e1, -e1), (-e2, e1 - e2)
         area = dr.gather(mi.Float, e.area, self.leaves)
         size, seen = dr.sqrt(area), dr.gather(mi.Float, e.open_area, self.leaves) / area
+        across = dr.gather(mi.UInt32, e.across, self.leaves)
         bound = [2 * t for t in totals([mi.Float64(dr.abs(h)) / mi.Float64(size) * 16 for h in H])]
         sums, weights = ColorSums(self.count, bound), ColorSums(self.count, 3 * [20 * totals([1 / mi.Float64(size)])[0]])
         for k, (a, b) in enumerate(sides):
             weight = dr.atan2(dr.norm(dr.cross(a, b)), dr.dot(a, b)) / size * seen
-            for vertex, w in ((self.corner[k], weight), (self.middle[k], dr.pi / size * seen)):
-                index = dr.gather(mi.UInt32, vertex, self.leaves)
+            for node, vertex, w in ((k, self.corner[k], weight), (k + 3, self.middle[k], dr.pi / size * seen)):
+                index = dr.select((across & (1 << node)) == 0, dr.gather(mi.UInt32, vertex, self.leaves), NONE)
                 sums.add([h * w for h in H], index, index != NONE)
                 weights.add([w, mi.Float(0), mi.Float(0)], index, index != NONE)
         every = dr.arange(mi.UInt32, self.count)
@@ -154,19 +182,43 @@ class _Topology:
     def straighten(self, values):
         """Put vertices in the middle of straight sides on the line between their ends."""
         for vertex, low, high in self.halved:
-            middle = .5 * (dr.gather(mi.Color3f, values, low) + dr.gather(mi.Color3f, values, high))
-            dr.scatter(values, middle, vertex)
+            dr.scatter(values, self._between(values, low, high), vertex)
             dr.eval(values)
         return values
 
-    def node_values(self, values):
-        """The six node values of every leaf (six Color3f [leaves])."""
-        corner = [dr.gather(mi.Color3f, values, dr.gather(mi.UInt32, c, self.leaves)) for c in self.corner]
+    def _between(self, values, low, high, active=True):
+        """The value in the middle of straight sides: the mean of the ends, or that of the one a wall leaves in sight (Color3f [n])."""
+        a, b = (dr.gather(mi.Color3f, values, end) for end in (low, high))
+        start, end = (dr.gather(mi.Point3f, self._point, k) for k in (low, high))
+        no_a, no_b = (self.elements.model.blocked(.5 * (start + end), x, active) for x in (start, end))
+        return dr.select(no_a & ~no_b, b, dr.select(no_b & ~no_a, a, .5 * (a + b)))
+
+    def node_points(self):
+        """Where the nodes of leaves are (six Point3f [leaves])."""
+        corner = [dr.gather(mi.Point3f, self._point, dr.gather(mi.UInt32, c, self.leaves)) for c in self.corner]
         nodes = list(corner)
         for k in range(3):
             index = dr.gather(mi.UInt32, self.middle[k], self.leaves)
             bent = index != NONE
-            nodes.append(dr.select(bent, dr.gather(mi.Color3f, values, index, bent), .5 * (corner[(k + 1) % 3] + corner[(k + 2) % 3])))
+            nodes.append(dr.select(bent, dr.gather(mi.Point3f, self._point, index, bent), .5 * (corner[(k + 1) % 3] + corner[(k + 2) % 3])))
+        dr.eval(nodes)
+        return nodes
+
+    def find_walls(self, nodes):
+        """Does a wall stand on a side of a leaf (Bool [leaves])? Both leaves of a side find the same."""
+        walled = dr.full(mi.Bool, False, dr.width(self.leaves))
+        for a, b in ((0, 5), (5, 1), (1, 3), (3, 2), (2, 4), (4, 0)):
+            walled |= self.elements.model.blocked(nodes[a], nodes[b], ~walled)
+        return walled
+
+    def node_values(self, values):
+        """The six node values of every leaf (six Color3f [leaves])."""
+        corner = [dr.gather(mi.UInt32, c, self.leaves) for c in self.corner]
+        nodes = [dr.gather(mi.Color3f, values, c) for c in corner]
+        for k in range(3):
+            index = dr.gather(mi.UInt32, self.middle[k], self.leaves)
+            bent = index != NONE
+            nodes.append(dr.select(bent, dr.gather(mi.Color3f, values, index, bent), self._between(values, corner[(k + 1) % 3], corner[(k + 2) % 3], ~bent)))
         return nodes
 
     def mean(self, values):
@@ -186,7 +238,7 @@ def _weld(model):
     """
     face, back = model.face, model.back
     keys = []
-    for k, (u, v) in enumerate(CORNERS):
+    for k, (u, v) in enumerate(NODES[:3]):
         one = dr.full(mi.Float, 1, model.count)
         point = model.corner(k)
         normal = model.faces.surface(face, one * u, one * v).sh_frame.n * dr.select(back, -1, 1)

@@ -101,9 +101,9 @@ def _recording_model(scene):
             self.power_rays.append(mi.Ray3f(origin, direction))
             return super().trace(origin, direction, active)
 
-        def blocked(self, ray, active):
-            self.oracle_rays.append((mi.Ray3f(ray), active))
-            return super().blocked(ray, active)
+        def blocked(self, a, b, active):
+            self.oracle_rays.append((mi.Point3f(a), mi.Point3f(b), active))
+            return super().blocked(a, b, active)
 
     Recorder.power_rays, Recorder.oracle_rays = [], []
     model = Recorder(scene)
@@ -116,8 +116,8 @@ def _trace(model, carried):
     for ray in carried:
         hit = model.tracing.ray_intersect_preliminary(ray)
         dr.eval(hit.prim_index, hit.shape_index, hit.prim_uv, hit.t)
-    for ray, active in model.oracle_rays:
-        dr.eval(model.tracing.ray_test(ray, active=active))
+    for line in model.oracle_rays:
+        dr.eval(Model.blocked(model, *line))
 
 
 if __name__ == "__main__":

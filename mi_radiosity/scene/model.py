@@ -172,6 +172,10 @@ class Model:
         return (dr.gather(mi.Point3f, self.p0, patch) + dr.gather(mi.Vector3f, self.e1, patch) * u
                 + dr.gather(mi.Vector3f, self.e2, patch) * v)
 
+    def above(self, patch, u, v):
+        """Points of patches, lifted off them by the rounding of rays (Point3f [n])."""
+        return mi.Point3f(self.point(patch, u, v) + dr.gather(mi.Vector3f, self.normal, patch) * self._lift)
+
     def corner(self, k):
         """Corner k of all patches where the file has it, to the bit (Point3f [patches])."""
         corner = self.faces.corners[self._faces, k].astype(np.float32)
@@ -207,9 +211,15 @@ class Model:
         owner, of_back, _, _ = self.overlaps.owner(face, back, u, v, dr.full(mi.Bool, True, dr.width(u)))
         return (owner == face) & (of_back == back)
 
-    def blocked(self, ray, active):
-        """Does anything lie on the segments ``ray`` (Bool [n])?"""
+    def blocked(self, a, b, active):
+        """Does anything lie between points a and b, relative to the scene's centre (Bool [n])?"""
+        ray = mi.Ray3f(a + self.origin, b - a)
+        ray.maxt = 1 - 1e-5
         return self.tracing.ray_test(ray, active=active)
+
+    def walled(self, patch, ua, va, ub, vb, active=True):
+        """Does anything stand on the line from (ua, va) to (ub, vb) of patches (Bool [n])?"""
+        return self.blocked(self.above(patch, ua, va), self.above(patch, ub, vb), active)
 
     def kernel(self, i, ui, vi, j, uj, vj):
         """F(x, y) = V(x, y) cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n]).
@@ -223,10 +233,7 @@ class Model:
         r2 = dr.squared_norm(d)
         cosines = dr.maximum(dr.dot(n_i, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
         faces = (cosines > 0) & (r2 > 0) & self.owns(i, ui, vi) & self.owns(j, uj, vj)
-        start = x + n_i * self._lift
-        ray = mi.Ray3f(start + self.origin, (y + n_j * self._lift) - start)
-        ray.maxt = 1 - 1e-5
-        seen = faces & ~self.blocked(ray, faces)
+        seen = faces & ~self.blocked(x + n_i * self._lift, y + n_j * self._lift, faces)
         return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
 
     def _connected(self, i, ui, vi, j, uj, vj):

@@ -5,8 +5,8 @@ import mitsuba as mi
 from ..scene.model import NONE
 from ..scene.sampling import cosine_direction, kronecker, triangle
 from .arrays import ColorSums, opaque_index
+from .elements import NODES
 
-INSET = 2.0 ** -12          # of an element: how far from its sides it is searched for walls
 GLANCE, LOOK = 8, 64        # points per leaf: of all leaves, and of those with a covered point
 LEAST = 1 / 128             # no open share is smaller, so that nothing divides by zero
 
@@ -33,31 +33,52 @@ def find_covered(elements, seed):
 
 
 def find_divided(elements):
-    """Set ``elements.divided``: does a wall stand across a leaf, or across one below an element (Bool [elements])?
+    """Set ``elements.divided``: does a wall stand across a leaf, or across one below an element?
 
-    What crosses a triangle crosses two of its sides, so lines just above the sides find it.
+    What crosses a triangle crosses its sides, so lines just above the sides find it. Until light
+    has come down, all nodes of such leaves that are not covered are ``across``.
     """
-    model, leaves = elements.model, elements.leaf_indices()
+    leaves = elements.leaf_indices()
     patch = dr.gather(mi.UInt32, elements.patch, leaves)
-    lift = dr.gather(mi.Vector3f, model.normal, patch) * model.offset
-    corners = [model.point(patch, *elements.patch_point(leaves, a, b)) + lift
-               for a, b in ((INSET, INSET), (1 - 2 * INSET, INSET), (INSET, 1 - 2 * INSET))]
+    corners = [elements.node_point(leaves, a, b) for a, b in NODES[:3]]
     divided = dr.full(mi.Bool, False, dr.width(leaves))
     for a, b in zip(corners, corners[1:] + corners[:1]):
-        ray = mi.Ray3f(a + model.origin, b - a)
-        ray.maxt = 1
-        divided |= model.blocked(ray, ~divided)
-    elements.divided = dr.zeros(mi.Bool, len(elements))
-    elements.mark_ancestors(elements.divided, dr.gather(mi.UInt32, leaves, dr.compress(divided)))
+        divided |= elements.model.walled(patch, *a, *b, ~divided)
+    leaves = dr.gather(mi.UInt32, leaves, dr.compress(divided))
+    elements.divided, elements.across = dr.zeros(mi.Bool, len(elements)), dr.zeros(mi.UInt32, len(elements))
+    if dr.width(leaves) == 0:
+        return
+    elements.mark_ancestors(elements.divided, leaves)
+    across = dr.zeros(mi.UInt32, dr.width(leaves))
+    for k, (a, b) in enumerate(NODES):
+        across |= dr.select(is_covered(elements, leaves, *elements.node_point(leaves, a, b)), mi.UInt32(0), 1 << k)
+    dr.scatter(elements.across, across, leaves)
+    dr.eval(elements.across)
+
+
+def note_light(elements, leaves, u, v):
+    """Nodes of divided ``leaves`` in sight of points (u, v), where light came down, are not across (NaN for none)."""
+    across = dr.gather(mi.UInt32, elements.across, leaves)
+    for k, (a, b) in enumerate(NODES):
+        seen = (u == u) & elements.in_sight(leaves, u, v, a, b, (u == u) & ((across & (1 << k)) != 0))
+        across &= ~dr.select(seen, mi.UInt32(1 << k), 0)
+    dr.scatter(elements.across, across, leaves)
+    dr.eval(elements.across)
 
 
 def _covered_share(elements, leaves, points, seed):
     """Share of ``points`` points of each leaf that are covered (Float [leaves])."""
-    model, each = elements.model, opaque_index(points)
+    each = opaque_index(points)
     k = dr.arange(mi.UInt32, dr.width(leaves) * points)
     leaf = dr.gather(mi.UInt32, leaves, k // each)
     x0, x1, s, t = kronecker(k % each, elements.key(leaves), opaque_index(seed ^ 0xC0), k // each)
-    patch, (u, v) = dr.gather(mi.UInt32, elements.patch, leaf), elements.patch_point(leaf, *triangle(x0, x1))
+    covered = is_covered(elements, leaf, *elements.patch_point(leaf, *triangle(x0, x1)), s, t)
+    return mi.Float(dr.block_sum(dr.select(covered, mi.UInt32(1), 0), points)) / mi.Float(each)
+
+
+def is_covered(elements, leaf, u, v, s=.3, t=.6):
+    """Are patch points (u, v) of leaves covered (Bool [n])? s, t: two numbers that say where rays look."""
+    model, patch = elements.model, dr.gather(mi.UInt32, elements.patch, leaf)
     normal, lamp = dr.gather(mi.Vector3f, model.normal, patch), dr.max(dr.gather(mi.Color3f, model.emission, patch)) > 0
     origin, aside = model.leave(patch, u, v, s, t)
     other = cosine_direction(normal, 1 - s, dr.select(t < .5, t + .5, t - .5))
@@ -66,5 +87,4 @@ def _covered_share(elements, leaves, points, seed):
         hit = model.trace(origin, direction, active)
         return active & hit.valid & (hit.patch == NONE)
 
-    covered = inside(other, inside(aside, inside(normal, ~lamp))) | ~model.owns(patch, u, v)
-    return mi.Float(dr.block_sum(dr.select(covered, mi.UInt32(1), 0), points)) / mi.Float(each)
+    return inside(other, inside(aside, inside(normal, ~lamp))) | ~model.owns(patch, u, v)

@@ -5,6 +5,8 @@ import mitsuba as mi
 from ..scene.sampling import hash_pair
 from .arrays import concat, opaque_index
 
+NODES = ((0., 0.), (1., 0.), (0., 1.), (.5, .5), (0., .5), (.5, 0.))     # of an element: corners, and middles opposite them
+TUCK = 2.0 ** -14   # how far inside of its element a node is when something is looked for between it and others
 MAX_LEVEL = 14      # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
 
 
@@ -18,7 +20,8 @@ class Elements:
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
     way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale`` (Float), ``area``
     and ``open_area`` (Float, m²; the second without what is covered, see `find_covered`),
-    ``reflectance`` (Color3f, the mean over the element), ``divided`` (Bool, see `find_divided`).
+    ``reflectance`` (Color3f, the mean over the element), ``divided`` (Bool) and ``across``
+    (UInt32, a bit for each of the NODES of a leaf that a wall keeps from its light, see `find_divided`).
     """
 
     def __init__(self, model):
@@ -32,7 +35,7 @@ class Elements:
         self.scale = dr.full(mi.Float, 1, n)
         self.area = self.open_area = mi.Float(model.area)
         self.reflectance = mi.Color3f(model.reflectance)
-        self.divided = dr.zeros(mi.Bool, n)
+        self.divided, self.across = dr.zeros(mi.Bool, n), dr.zeros(mi.UInt32, n)
         self.leaves = n
 
     def __len__(self):
@@ -123,6 +126,14 @@ class Elements:
             parent = dr.gather(mi.UInt32, self.parent, element)
             climbing = parent != element
             element = parent
+
+    def node_point(self, element, a, b):
+        """Patch coordinates (u, v) of a node (a, b) of elements: just off the walls that stand along their sides."""
+        return self.patch_point(element, *((1 - TUCK) * x + TUCK / 3 for x in (a, b)))
+
+    def in_sight(self, element, u, v, a, b, active=True):
+        """Is nothing between patch points (u, v) of elements and their nodes (a, b) (Bool [n])?"""
+        return ~self.model.walled(dr.gather(mi.UInt32, self.patch, element, active), u, v, *self.node_point(element, a, b), active)
 
     def patch_point(self, element, a, b):
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""

@@ -49,6 +49,7 @@ class Starved:
         direct = self._from_lamps(patch, u, v, line, key, s, t)
         indirect = self._from_room(patch, u, v, s, t, flow)
 
+        dr.scatter(e.across, mi.UInt32(0), self.leaves)
         leaves = e.leaf_indices()
         area = mi.Float64(dr.gather(mi.Float, e.open_area, leaves))
         whole = dr.gather(mi.Float, e.area, self.leaves) / dr.gather(mi.Float, e.open_area, self.leaves)

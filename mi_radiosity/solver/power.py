@@ -7,9 +7,11 @@ import mitsuba as mi
 from ..scene.model import NONE
 from ..scene.sampling import ROUNDS, hash_pair, kronecker, triangle
 from .arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
+from .cover import note_light
 
 TAIL = 0.01             # share of the power below which the rest is summed in closed form
 ITERATIONS = 64         # after so many the rest is summed in closed form, too
+SEATS = 8               # points of a divided leaf that it sends light from
 WEIGHTS = 2.0 ** 46     # resolution of the ray distribution over elements
 
 
@@ -65,6 +67,7 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     elements, model = pairs.elements, pairs.elements.model
     leaves = elements.leaf_indices()
     area = mi.Float64(dr.gather(mi.Float, elements.open_area, leaves))
+    divided = dr.gather(mi.UInt32, leaves, dr.compress(dr.gather(mi.Bool, elements.divided, leaves))) if record is None else None
     reflectance = dr.gather(mi.Color3f, elements.reflectance, leaves)
     emission = dr.gather(mi.Color3f, model.emission, dr.gather(mi.UInt32, elements.patch, leaves))
     power = [mi.Float64(e) * area for e in emission]                # unshot, per channel [leaves]
@@ -78,6 +81,8 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
         count = left if last else min(left, max(64, round(left * share)))
         if record is None:
             sums, seats = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, seats)
+            for k in range(SEATS if dr.width(divided) else 0):
+                note_light(elements, divided, *(dr.gather(mi.Float, seat, SEATS * divided + k) for seat in seats))
         else:
             sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, pilot=True)
             record.append(rays_seen)
@@ -111,8 +116,8 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pil
     """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
 
     Returns the sums per element, followed by two bins for power that escapes and that is blocked,
-    and the RayRecord if ``pilot``, else the seats for the next iteration: of every divided leaf the
-    patch point where one of its rays came down, drawn at random (two Float [elements]).
+    and the RayRecord if ``pilot``, else the seats for the next iteration: of every divided leaf
+    patch points where rays came down, drawn at random (two Float [SEATS · elements], NaN for none).
     """
     elements, model = pairs.elements, pairs.elements.model
     # Integer weights: the distribution is the same on any number of threads.
@@ -141,7 +146,7 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pil
     uj, vj = elements.patch_point(source, *triangle(x0, x1))
     seated = dr.gather(mi.Bool, elements.divided, source) if seats else dr.full(mi.Bool, False, count)
     if seats:
-        uj, vj = (dr.select(seated, dr.gather(mi.Float, seat, source, seated), x) for seat, x in zip(seats, (uj, vj)))
+        uj, vj = (dr.select(seated, dr.gather(mi.Float, seat, SEATS * source + ray % SEATS, seated), x) for seat, x in zip(seats, (uj, vj)))
     hit = model.trace(*model.leave(j, uj, vj, d0, d1))
 
     on_patch = hit.patch != NONE
@@ -170,18 +175,26 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pil
 
 
 def _seats(elements, leaf, hit, active):
-    """Of each leaf one of the points that ``active`` rays meet it at (two Float [elements])."""
-    # The least of well mixed numbers: any of them, but the same on any number of threads.
-    lot = mi.UInt64(hash_pair(dr.arange(mi.UInt32, dr.width(leaf)), 0)) << 32 | mi.UInt64(dr.arange(mi.UInt32, dr.width(leaf)))
-    least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, len(elements))
-    dr.scatter_reduce(dr.ReduceOp.Min, least, lot, leaf, active)
-    drawn = active & (dr.gather(mi.UInt64, least, leaf, active) == lot)
-    seats = []
-    for x in (hit.u, hit.v):
-        seat = dr.zeros(mi.Float, len(elements))
-        dr.scatter(seat, x, leaf, drawn)
-        seats.append(seat)
-    dr.eval(seats)
+    """Of each leaf some of the points that ``active`` rays meet it at (two Float [SEATS · elements])."""
+    u, v, seats = hit.u, hit.v, [dr.full(mi.Float, dr.nan, SEATS * len(elements)) for _ in range(2)]
+    dr.eval(leaf, u, v, active)         # lest the rays be traced again
+    ray = dr.compress(active)
+    if dr.width(ray):
+        # The least of well mixed numbers: any of them, but the same on any number of threads.
+        number = hash_pair(ray, 0)
+        seat, lot = SEATS * dr.gather(mi.UInt32, leaf, ray) + number % SEATS, (mi.UInt64(number) << 32) | mi.UInt64(ray)
+        least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * len(elements))
+        dr.scatter_reduce(dr.ReduceOp.Min, least, lot, seat)
+        drawn = dr.gather(mi.UInt64, least, seat) == lot
+        for points, x in zip(seats, (u, v)):
+            dr.scatter(points, dr.gather(mi.Float, x, ray), seat, drawn)
+        # Seats left empty are shared with the next one taken.
+        k = dr.arange(mi.UInt32, SEATS * len(elements))
+        for step in (1, 2, 4):
+            other = (k & ~mi.UInt32(SEATS - 1)) | ((k + step) & (SEATS - 1))
+            dr.eval(seats)
+            seats = [dr.select(dr.isnan(points), dr.gather(mi.Float, points, other), points) for points in seats]
+        dr.eval(seats)
     return seats
 
 

@@ -13,7 +13,7 @@ from ..scene.faces import owned
 from .elements import Elements
 
 FORMAT = 2
-TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale", "open_area")
+TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale", "open_area", "across")
 COLORS = ("reflectance", "direct", "indirect")
 
 
@@ -80,7 +80,7 @@ class Solution:
         model.use_sides(sides)
         elements = Elements(model)
         for name, array in tree.items():
-            setattr(elements, name, owned(mi.UInt32 if array.dtype.kind == "u" else mi.Float, array))
+            setattr(elements, name, owned(mi.Float if array.dtype.kind == "f" else mi.UInt32, array))
         def color(name): return mi.Color3f(*(owned(mi.Float, c) for c in colors[name]))
         elements.reflectance = color("reflectance")
         elements.area = dr.gather(mi.Float, model.area, elements.patch) * elements.scale ** 2
