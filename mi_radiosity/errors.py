@@ -8,10 +8,10 @@ class RadiosityError(ValueError):
 
 @contextmanager
 def interruptible():
-    """Let Ctrl-C out of the body as KeyboardInterrupt: Dr.Jit wraps what its loops meet in RuntimeError."""
+    """Let Ctrl-C out of the body as KeyboardInterrupt: loops of Dr.Jit and imports of extensions wrap it in other errors."""
     try:
         yield
-    except RuntimeError as error:
+    except Exception as error:
         cause = error
         while cause is not None:
             if isinstance(cause, KeyboardInterrupt):

@@ -1,8 +1,10 @@
 """What goes wrong around a solve: threads, processes, interruptions, disks."""
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +13,7 @@ import pytest
 from conftest import ORACLES
 
 import mi_radiosity as mr
+from mi_radiosity.evaluation.reference import Reference, render_reference
 from mi_radiosity.scene import Model
 
 SOLVE = """
@@ -145,6 +148,56 @@ def test_an_interrupted_save_keeps_the_old_file(solution, tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         solution.save(file)
     assert os.listdir(tmp_path) == ["kept.npz"] and file.read_bytes() == before
+
+
+CLI = [sys.executable, "-c", "import sys; from mi_radiosity.cli import main; print('ready', flush=True); sys.exit(main())"]
+BOX = "scenes_xml/cornell_box.xml"
+
+
+@pytest.mark.parametrize("seconds", [0.2, 4.0])
+def test_a_real_interrupt(tmp_path, seconds):
+    """SIGINT while the scene loads and while rays are cast: exit status 130, one line, no traceback, nothing half-written."""
+    run = subprocess.Popen([*CLI, "render", BOX, "-o", str(tmp_path / "x.exr"), "--rays", "2000000000"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert run.stdout.readline() == "ready\n"
+    time.sleep(seconds)
+    run.send_signal(signal.SIGINT)
+    _, said = run.communicate(timeout=120)
+    assert (run.returncode, os.listdir(tmp_path)) == (130, []), said
+    assert said.strip().count("\n") == 0 and "interrupted" in said
+
+
+@pytest.fixture
+def small_box(tmp_path):
+    """The Cornell box as a scene file with a film of 32 × 32."""
+    file = tmp_path / "box.xml"
+    with open(BOX, encoding="utf-8") as box:
+        file.write_text(box.read().replace('value="256"', 'value="32"'), encoding="utf-8")
+    return file
+
+
+def test_two_processes_on_one_reference(small_box, tmp_path):
+    """Both end well, the file is whole and has the samples the greedier one asked for."""
+    file = tmp_path / "ref.exr"
+    runs = [subprocess.Popen([*CLI, "reference", str(small_box), "-o", str(file), "--spp", str(spp)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+            for spp in (512, 4096)]
+    for run in runs:
+        _, said = run.communicate(timeout=300)
+        assert run.returncode == 0, said
+    reference = Reference.load(file)
+    assert reference.image().shape == (32, 32, 3) and sum(reference.spp) == 4096 and sorted(os.listdir(tmp_path)) == ["box.xml", "ref.exr"]
+
+
+def test_work_of_another_process_is_not_undone(small_box, tmp_path):
+    """A process that finds a reference further on than its own goes on from there."""
+    file, ahead, seen = tmp_path / "ref.exr", tmp_path / "ahead.exr", []
+    scene = mi.load_file(str(small_box))
+    render_reference(scene, scene.sensors()[0], ahead, spp=512)
+    def progress(done, total):
+        seen.append(done)
+        if done == 64:
+            os.replace(ahead, file)
+    found = render_reference(scene, scene.sensors()[0], file, spp=640, progress=progress)
+    assert seen == [64, 128, 576, 640] and sum(found.spp) == sum(Reference.load(file).spp) == 640
 
 
 def test_a_plugin_that_was_interrupted_solves_again(cornell):

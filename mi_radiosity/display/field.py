@@ -99,7 +99,7 @@ class _Topology:
         e, every = self.elements, dr.arange(mi.UInt32, len(self.elements))
         self._point, first = dr.zeros(mi.Point3f, self.count), dr.full(mi.UInt32, NONE, self.count)
         for corner in self.corner:
-            dr.scatter_reduce(dr.ReduceOp.Min, first, every, corner)
+            dr.scatter_reduce(dr.ReduceOp.Min, first, every, corner, mode=dr.ReduceMode.Direct)
         for corner, place in zip(self.corner, NODES):
             point = e.model.above(e.patch, *e.node_point(every, *place))
             dr.scatter(self._point, point, corner, dr.gather(mi.UInt32, first, corner) == every)

@@ -80,20 +80,15 @@ def render_reference(scene, sensor, path, spp=1024, seed=0, progress=lambda done
 
     Passes alternate between the two halves and each is kept as soon as it is done, so a run that was
     stopped goes on where it was, and a finished one can be given more samples. Depth is unlimited,
-    which is what the solver models. progress is told samples per pixel.
+    which is what the solver models. Processes may share a file: none undoes what another has done.
+    progress is told samples per pixel.
 
     Raises RadiosityError if the file holds something else.
     """
     model = scene if isinstance(scene, Model) else Model(scene)
     want = identity(model, sensor, seed)
     height, width = sensor.film().crop_size()[1], sensor.film().crop_size()[0]
-    if path.exists():
-        reference = Reference.load(path)
-        changed = [name for name in want if reference.identity.get(name) != want[name]]
-        if changed:
-            raise RadiosityError(f"{path} is the reference of another {' and '.join(changed)}: remove it or choose another name")
-    else:
-        reference = Reference(want, np.zeros((2, height, width, 3)))
+    reference = _kept(path, want) or Reference(want, np.zeros((2, height, width, 3)))
     each = pass_size(width * height)
     tracer = _path_with("stratified")
     while sum(reference.spp) < spp or reference.spp[0] != reference.spp[1]:
@@ -104,7 +99,22 @@ def render_reference(scene, sensor, path, spp=1024, seed=0, progress=lambda done
         reference.spp[half] += each
         progress(sum(reference.spp), spp)
         if reference.spp[0] == reference.spp[1]:
-            reference.save(path)
+            kept = _kept(path, want)
+            if kept and sum(kept.spp) >= sum(reference.spp):        # another process is ahead: go on from there
+                reference = kept
+            else:
+                reference.save(path)
+    return reference
+
+
+def _kept(path, want):
+    """The Reference in ``path`` if there is one; an error if it is not of identity ``want``."""
+    if not path.exists():
+        return None
+    reference = Reference.load(path)
+    changed = [name for name in want if reference.identity.get(name) != want[name]]
+    if changed:
+        raise RadiosityError(f"{path} is the reference of another {' and '.join(changed)}: remove it or choose another name")
     return reference
 
 

@@ -57,12 +57,12 @@ def find_divided(elements):
 
 
 def note_light(elements, leaves, u, v):
-    """Nodes of divided ``leaves`` in sight of points (u, v), where light came down, are not across (NaN for none)."""
-    across = dr.gather(mi.UInt32, elements.across, leaves)
+    """Nodes of divided ``leaves`` in sight of points (u, v) where light came down (NaN for none) are not across."""
+    across, seen = dr.gather(mi.UInt32, elements.across, leaves), mi.UInt32(0)
     for k, (a, b) in enumerate(NODES):
-        seen = (u == u) & elements.in_sight(leaves, u, v, a, b, (u == u) & ((across & (1 << k)) != 0))
-        across &= ~dr.select(seen, mi.UInt32(1 << k), 0)
-    dr.scatter(elements.across, across, leaves)
+        asked = ~dr.isnan(u) & ((across & (1 << k)) != 0)
+        seen |= dr.select(asked & elements.in_sight(leaves, u, v, a, b, asked), mi.UInt32(1 << k), 0)
+    dr.scatter_reduce(dr.ReduceOp.And, elements.across, ~seen, leaves, mode=dr.ReduceMode.Direct)
     dr.eval(elements.across)
 
 

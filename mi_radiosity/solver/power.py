@@ -12,6 +12,7 @@ from .cover import note_light
 TAIL = 0.01             # share of the power below which the rest is summed in closed form
 ITERATIONS = 64         # after so many the rest is summed in closed form, too
 SEATS = 8               # points of a divided leaf that it sends light from
+AT_ONCE = 1 << 23       # rays cast in one launch: bounds memory, and the time until an interrupt is heard
 WEIGHTS = 2.0 ** 46     # resolution of the ray distribution over elements
 
 
@@ -80,11 +81,12 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
         last = flow.iterations > 0 and (flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted))
         count = left if last else min(left, max(64, round(left * share)))
         if record is None:
-            sums, seats = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, seats)
-            for k in range(SEATS if dr.width(divided) else 0):
-                note_light(elements, divided, *(dr.gather(mi.Float, seat, SEATS * divided + k) for seat in seats))
+            sums, seats = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: progress(rays - left + cast), seats)
+            if dr.width(divided):
+                leaf = dr.repeat(divided, SEATS)
+                note_light(elements, leaf, *seats.points(leaf, dr.arange(mi.UInt32, dr.width(leaf))))
         else:
-            sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, pilot=True)
+            sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: None, pilot=True)
             record.append(rays_seen)
         left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
@@ -105,19 +107,18 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
         share = 1 - min(sum(after) / sum(unshot), 0.999)
         unshot = after if left else [0.0] * 3
         flow.iterations += 1
-        progress(rays - left)
     flow.rays, flow.unshot = rays - left, unshot
     flow.first_share = sum(flow.emitted) / shot
     flow.direct, flow.indirect = (pull(elements, leaves, area, irradiance) for irradiance in (direct, indirect))
     return flow
 
 
-def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pilot=False):
+def _shoot(pairs, leaves, power, unshot, count, iteration, seed, progress, seats=None, pilot=False):
     """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
 
     Returns the sums per element, followed by two bins for power that escapes and that is blocked,
-    and the RayRecord if ``pilot``, else the seats for the next iteration: of every divided leaf
-    patch points where rays came down, drawn at random (two Float [SEATS · elements], NaN for none).
+    and the RayRecord if ``pilot``, else the Seats for the next iteration. progress is told how many
+    of the rays are cast.
     """
     elements, model = pairs.elements, pairs.elements.model
     # Integer weights: the distribution is the same on any number of threads.
@@ -127,75 +128,91 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, seats=None, pil
     dr.eval(cumulative, weight)
     whole = dr.gather(mi.UInt64, cumulative, dr.width(cumulative) - 1)[0]
 
-    ray = dr.arange(mi.UInt32, count)
     key = opaque_index(seed)
     jitter = mi.sample_tea_float32(opaque_index(iteration), key ^ 0x5EED, ROUNDS)
     dr.eval(jitter)
-    spacing = dr.opaque(mi.Float64, whole / count)
-    k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
-    source = dr.gather(mi.UInt32, leaves, k)
-    if pilot:
-        # Numbered within their leaf, so that what happens elsewhere leaves the mesh here alone.
-        start = mi.Float64(dr.gather(mi.UInt64, cumulative, k) - dr.gather(mi.UInt64, weight, k)) / spacing - jitter
-        number, owner = ray - mi.UInt32(dr.maximum(dr.ceil(start), 0)), elements.key(leaves)
-        x0, x1, d0, d1 = kronecker(number, owner, key ^ hash_pair(opaque_index(iteration), key), k)
-    else:
-        # Numbered through: rays of neighbouring leaves are well spread among each other.
-        x0, x1, d0, d1 = kronecker(ray, opaque_index(iteration), key)
-    j = dr.gather(mi.UInt32, elements.patch, source)
-    uj, vj = elements.patch_point(source, *triangle(x0, x1))
-    seated = dr.gather(mi.Bool, elements.divided, source) if seats else dr.full(mi.Bool, False, count)
-    if seats:
-        uj, vj = (dr.select(seated, dr.gather(mi.Float, seat, SEATS * source + ray % SEATS, seated), x) for seat, x in zip(seats, (uj, vj)))
-    hit = model.trace(*model.leave(j, uj, vj, d0, d1))
+    spacing, n = dr.opaque(mi.Float64, whole / count), len(elements)
+    sums, taken = ColorSums(n + 2, [4 * u for u in unshot]), None if pilot else Seats(n)
+    for first in range(0, count, AT_ONCE):
+        ray = opaque_index(first) + dr.arange(mi.UInt32, min(AT_ONCE, count - first))
+        k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
+        source = dr.gather(mi.UInt32, leaves, k)
+        if pilot:
+            # Numbered within their leaf, so that what happens elsewhere leaves the mesh here alone.
+            start = mi.Float64(dr.gather(mi.UInt64, cumulative, k) - dr.gather(mi.UInt64, weight, k)) / spacing - jitter
+            number, owner = ray - mi.UInt32(dr.maximum(dr.ceil(start), 0)), elements.key(leaves)
+            x0, x1, d0, d1 = kronecker(number, owner, key ^ hash_pair(opaque_index(iteration), key), k)
+        else:
+            # Numbered through: rays of neighbouring leaves are well spread among each other.
+            x0, x1, d0, d1 = kronecker(ray, opaque_index(iteration), key)
+        j = dr.gather(mi.UInt32, elements.patch, source)
+        uj, vj = elements.patch_point(source, *triangle(x0, x1))
+        seated = dr.gather(mi.Bool, elements.divided, source) if seats else dr.full(mi.Bool, False, dr.width(ray))
+        if seats:
+            uj, vj = (dr.select(seated, at, x) for at, x in zip(seats.points(source, ray, seated), (uj, vj)))
+        hit = model.trace(*model.leave(j, uj, vj, d0, d1))
 
-    on_patch = hit.patch != NONE
-    pair = pairs.find_roots(hit.patch, j, on_patch)
-    known = pair != NONE
-    pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
-    receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
+        on_patch = hit.patch != NONE
+        pair = pairs.find_roots(hit.patch, j, on_patch)
+        known = pair != NONE
+        pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
+        receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
+        if not pilot:
+            vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0) & ~dr.gather(mi.Bool, pairs.partial, pair, known)
+            vetted &= ~dr.gather(mi.Bool, elements.divided, receiver, known)
+            receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
+        bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
+        # Rays that start inside a solid or under a face go nowhere; the others of their element carry their power.
+        share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
+        share = dr.select(seated, 1, share)
+        starts = ((share >= 1) | on_patch | ~hit.valid) & model.owns(j, uj, vj)
+        each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
+        sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
+        if pilot:
+            taken = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
+            dr.eval(taken.i, taken.ui, taken.vi, taken.j, taken.uj, taken.vj, taken.pair)
+        else:
+            taken.take(receiver, hit.u, hit.v, ray, on_patch & dr.gather(mi.Bool, elements.divided, receiver, on_patch))
+        progress(first + dr.width(ray))
     if not pilot:
-        vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0) & ~dr.gather(mi.Bool, pairs.partial, pair, known)
-        vetted &= ~dr.gather(mi.Bool, elements.divided, receiver, known)
-        receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
-    n = len(elements)
-    bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
-    # Rays that start inside a solid or under a face go nowhere; the others of their element carry their power.
-    share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
-    share = dr.select(seated, 1, share)
-    starts = ((share >= 1) | on_patch | ~hit.valid) & model.owns(j, uj, vj)
-    each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
-    sums = ColorSums(n + 2, [4 * u for u in unshot])
-    sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
-    if not pilot:
-        return sums, _seats(elements, receiver, hit, on_patch & dr.gather(mi.Bool, elements.divided, receiver, on_patch))
-    record = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
-    dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
-    return sums, record
+        taken.settle()
+    return sums, taken
 
 
-def _seats(elements, leaf, hit, active):
-    """Of each leaf some of the points that ``active`` rays meet it at (two Float [SEATS · elements])."""
-    u, v, seats = hit.u, hit.v, [dr.full(mi.Float, dr.nan, SEATS * len(elements)) for _ in range(2)]
-    dr.eval(leaf, u, v, active)         # lest the rays be traced again
-    ray = dr.compress(active)
-    if dr.width(ray):
+class Seats:
+    """Points where light came down on divided leaves, which send it on from there: SEATS per leaf, drawn at random."""
+
+    def __init__(self, elements):
+        self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * elements)
+        self._uv = [dr.full(mi.Float, dr.nan, SEATS * elements) for _ in range(2)]
+
+    def take(self, leaf, u, v, ray, active):
+        """Offer the patch points (u, v) where rays (UInt32 [n]) meet leaves."""
+        dr.eval(leaf, u, v, active)         # lest the rays be traced again
+        offer = dr.compress(active)
+        if dr.width(offer) == 0:
+            return
         # The least of well mixed numbers: any of them, but the same on any number of threads.
+        ray = dr.gather(mi.UInt32, ray, offer)
         number = hash_pair(ray, 0)
-        seat, lot = SEATS * dr.gather(mi.UInt32, leaf, ray) + number % SEATS, (mi.UInt64(number) << 32) | mi.UInt64(ray)
-        least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * len(elements))
-        dr.scatter_reduce(dr.ReduceOp.Min, least, lot, seat)
-        drawn = dr.gather(mi.UInt64, least, seat) == lot
-        for points, x in zip(seats, (u, v)):
-            dr.scatter(points, dr.gather(mi.Float, x, ray), seat, drawn)
-        # Seats left empty are shared with the next one taken.
-        k = dr.arange(mi.UInt32, SEATS * len(elements))
+        seat, lot = SEATS * dr.gather(mi.UInt32, leaf, offer) + number % SEATS, (mi.UInt64(number) << 32) | mi.UInt64(ray)
+        dr.scatter_reduce(dr.ReduceOp.Min, self._least, lot, seat, mode=dr.ReduceMode.Direct)
+        drawn = dr.gather(mi.UInt64, self._least, seat) == lot
+        for points, x in zip(self._uv, (u, v)):
+            dr.scatter(points, dr.gather(mi.Float, x, offer), seat, drawn)
+        dr.eval(self._uv)
+
+    def settle(self):
+        """Share seats with those that were left empty, once all rays are cast."""
+        k = dr.arange(mi.UInt32, dr.width(self._least))
         for step in (1, 2, 4):
             other = (k & ~mi.UInt32(SEATS - 1)) | ((k + step) & (SEATS - 1))
-            dr.eval(seats)
-            seats = [dr.select(dr.isnan(points), dr.gather(mi.Float, points, other), points) for points in seats]
-        dr.eval(seats)
-    return seats
+            self._uv = [dr.select(dr.isnan(x), dr.gather(mi.Float, x, other), x) for x in self._uv]
+            dr.eval(self._uv)
+
+    def points(self, leaf, number, active=True):
+        """Patch points of leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light came down."""
+        return [dr.gather(mi.Float, x, SEATS * leaf + number % SEATS, active) for x in self._uv]
 
 
 def _push(elements, sums, leaves, scale):
