@@ -171,7 +171,8 @@ def small_box(tmp_path):
     """The Cornell box as a scene file with a film of 32 × 32."""
     file = tmp_path / "box.xml"
     with open(BOX, encoding="utf-8") as box:
-        file.write_text(box.read().replace('value="256"', 'value="32"'), encoding="utf-8")
+        text = box.read().replace('value="256"', 'value="32"').replace('"meshes/', f'"{os.path.abspath("scenes_xml")}/meshes/')
+    file.write_text(text, encoding="utf-8")
     return file
 
 
