@@ -8,8 +8,10 @@ from .arrays import lower_bound, opaque_index, totals
 from .power import WEIGHTS, pull
 
 ENOUGH = 16             # rays a patch should expect
-SAMPLES = 32            # lines to lamps, and as many rays into the room, per starved leaf
-SHARE = 0.2             # of the ray budget, at most
+SAMPLES = 32            # lines to lamps, and as many rays into the room, per starved leaf;
+MOST_SAMPLES = 1024     # more of them while that takes no more than
+CHEAP = 0.02            # of the ray budget,
+SHARE = 0.2             # and fewer so that it never takes more than this
 
 
 class Starved:
@@ -28,6 +30,8 @@ class Starved:
         self.leaves = dr.compress((elements.child == 0) & small)
         count = dr.width(self.leaves)
         self.samples = SAMPLES
+        while count and self.samples < MOST_SAMPLES and 4 * self.samples * count <= CHEAP * rays:
+            self.samples *= 2
         while count and self.samples > 1 and 2 * self.samples * count > SHARE * rays:
             self.samples //= 2
         if 2 * self.samples * count > SHARE * rays:
