@@ -129,13 +129,14 @@ class Refinement:
         # Floats ≥ 0 sort like their bits, and a maximum does not depend on the order.
         dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE, mode=dr.ReduceMode.Local)
         worst = dr.reinterpret_array(mi.Float, worst)
+        # The level only comes down, and only when all above it are split: one freak pair must not
+        # decide how far the others get.
         peak = dr.max(value)[0]
         if peak < self.level:
             self.level = max(self.floor or 0.0, STEP * peak)
-        least = self.level
-        leaves = dr.compress((e.child == 0) & (worst > 0) & (worst >= dr.opaque(mi.Float, least)))
+        leaves = dr.compress((e.child == 0) & (worst > 0) & (worst >= dr.opaque(mi.Float, self.level)))
         count = min(dr.width(leaves), max(LEAST_SPLITS, round(GROWTH * e.leaves)), room)
-        self.epsilon = least
+        self.epsilon = self.level
         if count == 0:
             return 0
         worst = dr.gather(mi.Float, worst, leaves)
