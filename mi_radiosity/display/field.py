@@ -59,13 +59,14 @@ class Field:
         middle = quarter == 3
         a = dr.select(middle, 1 - 2 * a, 2 * a - dr.select(quarter == 1, 1., 0.))
         b = dr.select(middle, 1 - 2 * b, 2 * b - dr.select(quarter == 2, 1., 0.))
-        def pick(kind, choices): return dr.select(quarter == 0, kind(choices[0]), dr.select(quarter == 1, kind(choices[1]), dr.select(quarter == 2, kind(choices[2]), kind(choices[3]))))
+        def pick(*nodes): return dr.select(quarter == 0, mi.UInt32(nodes[0]), dr.select(quarter == 1, mi.UInt32(nodes[1]), dr.select(quarter == 2, mi.UInt32(nodes[2]), mi.UInt32(nodes[3]))))
         walled = active & dr.gather(mi.Bool, self.walled, leaf, active)
         x = e.model.above(dr.gather(mi.UInt32, e.patch, leaf, active), u, v)
         total, seen, weights = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
         for nodes, weight in (((0, 5, 4, 3), 1 - a - b), ((5, 1, 3, 4), a), ((4, 3, 2, 5), b)):
-            value = dr.gather(mi.Color3f, self.nodes, 6 * leaf + pick(mi.UInt32, nodes), active)
-            hidden = e.model.blocked(x, dr.gather(mi.Point3f, self.points, 6 * leaf + pick(mi.UInt32, nodes), walled), walled)
+            node = 6 * leaf + pick(*nodes)
+            value = dr.gather(mi.Color3f, self.nodes, node, active)
+            hidden = e.model.blocked(x, dr.gather(mi.Point3f, self.points, node, walled), walled)
             total, seen = total + value * weight, seen + dr.select(hidden, 0, value * weight)
             weights += dr.select(hidden, 0, weight)
         return dr.select(walled & (weights > FAINT), seen / weights, total)
@@ -195,12 +196,8 @@ class _Topology:
 
     def node_points(self):
         """Where the nodes of leaves are (six Point3f [leaves])."""
-        corner = [dr.gather(mi.Point3f, self._point, dr.gather(mi.UInt32, c, self.leaves)) for c in self.corner]
-        nodes = list(corner)
-        for k in range(3):
-            index = dr.gather(mi.UInt32, self.middle[k], self.leaves)
-            bent = index != NONE
-            nodes.append(dr.select(bent, dr.gather(mi.Point3f, self._point, index, bent), .5 * (corner[(k + 1) % 3] + corner[(k + 2) % 3])))
+        def halfway(low, high, active): return .5 * (dr.gather(mi.Point3f, self._point, low) + dr.gather(mi.Point3f, self._point, high))
+        nodes = self._nodes(self._point, halfway)
         dr.eval(nodes)
         return nodes
 
@@ -213,12 +210,16 @@ class _Topology:
 
     def node_values(self, values):
         """The six node values of every leaf (six Color3f [leaves])."""
+        return self._nodes(values, lambda low, high, active: self._between(values, low, high, active))
+
+    def _nodes(self, table, straight):
+        """What ``table`` says of the nodes of leaves, ``straight`` being asked for the middles of straight sides (six of its kind [leaves])."""
         corner = [dr.gather(mi.UInt32, c, self.leaves) for c in self.corner]
-        nodes = [dr.gather(mi.Color3f, values, c) for c in corner]
+        nodes = [dr.gather(type(table), table, c) for c in corner]
         for k in range(3):
             index = dr.gather(mi.UInt32, self.middle[k], self.leaves)
             bent = index != NONE
-            nodes.append(dr.select(bent, dr.gather(mi.Color3f, values, index, bent), self._between(values, corner[(k + 1) % 3], corner[(k + 2) % 3], ~bent)))
+            nodes.append(dr.select(bent, dr.gather(type(table), table, index, bent), straight(corner[(k + 1) % 3], corner[(k + 2) % 3], ~bent)))
         return nodes
 
     def mean(self, values):
