@@ -4,13 +4,20 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_radiosity.solver.cover import is_covered
+from mi_radiosity.mesh.exposure import is_covered
 
 mi.set_variant("llvm_ad_rgb")
 mi.set_log_level(mi.LogLevel.Error)
 
 
-ORACLES = [mi_radiosity.KS(), mi_radiosity.MI(), mi_radiosity.GMI(0.5), mi_radiosity.GMI(1.5), mi_radiosity.Power(), mi_radiosity.Uniform()]
+ORACLES = [
+    mi_radiosity.KS(),
+    mi_radiosity.MI(),
+    mi_radiosity.GMI(0.5),
+    mi_radiosity.GMI(1.5),
+    mi_radiosity.Power(),
+    mi_radiosity.Uniform(),
+]
 
 
 @pytest.fixture(scope="session")
@@ -20,8 +27,11 @@ def cornell():
 
 def scene(optimize=True, **shapes):
     """A scene of shapes given as dictionaries, with a small camera; ``optimize`` merges those that share a BSDF."""
-    camera = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
-              "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}}
+    camera = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"},
+    }
     return mi.load_dict({"type": "scene", "camera": camera, **shapes}, optimize=optimize)
 
 
@@ -74,10 +84,43 @@ def quad(corners, **parts):
 
 def icosphere(subdivisions, inwards=True):
     """(vertices, faces) of a unit sphere made of 20 · 4^subdivisions triangles."""
-    g = (1 + 5 ** .5) / 2
-    vertices = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
-    faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-             (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)]
+    g = (1 + 5**0.5) / 2
+    vertices = [
+        (-1, g, 0),
+        (1, g, 0),
+        (-1, -g, 0),
+        (1, -g, 0),
+        (0, -1, g),
+        (0, 1, g),
+        (0, -1, -g),
+        (0, 1, -g),
+        (g, 0, -1),
+        (g, 0, 1),
+        (-g, 0, -1),
+        (-g, 0, 1),
+    ]
+    faces = [
+        (0, 11, 5),
+        (0, 5, 1),
+        (0, 1, 7),
+        (0, 7, 10),
+        (0, 10, 11),
+        (1, 5, 9),
+        (5, 11, 4),
+        (11, 10, 2),
+        (10, 7, 6),
+        (7, 1, 8),
+        (3, 9, 4),
+        (3, 4, 2),
+        (3, 2, 6),
+        (3, 6, 8),
+        (3, 8, 9),
+        (4, 9, 5),
+        (2, 4, 11),
+        (6, 2, 10),
+        (8, 6, 7),
+        (9, 8, 1),
+    ]
     corners = np.array(vertices)[np.array(faces)] / np.sqrt(1 + g * g)
     for _ in range(subdivisions):
         a, b, c = corners.transpose(1, 0, 2)
@@ -104,7 +147,10 @@ def leaf_corners(solution):
     e, model = solution.elements, solution.model
     leaf = mi.UInt32(np.flatnonzero(np.array(e.child) == 0).astype(np.uint32))
     patch = dr.gather(mi.UInt32, e.patch, leaf)
-    corners = [np.array(model.point(patch, *e.patch_point(leaf, mi.Float(a), mi.Float(b)))).T for a, b in ((0, 0), (1, 0), (0, 1))]
+    corners = [
+        np.array(model.point(patch, *e.patch_point(leaf, mi.Float(a), mi.Float(b)))).T
+        for a, b in ((0, 0), (1, 0), (0, 1))
+    ]
     return np.stack(corners, axis=1) + model.centre
 
 
@@ -125,7 +171,11 @@ def border_values(solution):
     u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
     patch = dr.gather(mi.UInt32, e.patch, index)
     shown = ~np.array(is_covered(e, index, u, v)).astype(bool)
-    found = mi_radiosity.display.Field(solution).at(index, u, v), model.point(patch, u, v), dr.gather(mi.Vector3f, model.normal, patch)
+    found = (
+        mi_radiosity.display.Field(solution).at(index, u, v),
+        model.point(patch, u, v),
+        dr.gather(mi.Vector3f, model.normal, patch),
+    )
     values, points, normals = (np.array(x).T[shown] for x in found)
     return points, normals, values, model.faces.shape[np.array(dr.gather(mi.UInt32, model.face, patch))[shown]]
 
@@ -133,7 +183,7 @@ def border_values(solution):
 def gaps_between_leaves(solution):
     """Differences, relative to the brightest value, between leaves where they meet on one shape [places]."""
     points, normals, values, shapes = border_values(solution)
-    key = np.round(np.column_stack([points * 2 ** 14, normals * 100, shapes])).astype(np.int64)
+    key = np.round(np.column_stack([points * 2**14, normals * 100, shapes])).astype(np.int64)
     _, group = np.unique(key, axis=0, return_inverse=True)
     low, high = np.full((group.max() + 1, 3), np.inf), np.full((group.max() + 1, 3), -np.inf)
     np.minimum.at(low, group.ravel(), values)
@@ -145,7 +195,10 @@ def wall_means(solution):
     """Mean radiosity of every wall {number: [3]}; what lies inside solids counts as dark, as it does for others."""
     values, areas, patches = leaf_values(solution)
     walls, whole = names_of_walls(solution.model), np.array(solution.model.area)
-    return {wall: areas[walls[patches] == wall] @ values[walls[patches] == wall] / whole[walls == wall].sum() for wall in np.unique(walls)}
+    return {
+        wall: areas[walls[patches] == wall] @ values[walls[patches] == wall] / whole[walls == wall].sum()
+        for wall in np.unique(walls)
+    }
 
 
 def names_of_walls(model):

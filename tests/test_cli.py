@@ -1,4 +1,5 @@
 """The command line: files, exit statuses, one line for every error."""
+
 import json
 
 import mitsuba as mi
@@ -15,7 +16,19 @@ def test_render_writes_what_it_is_asked_for(tmp_path, capsys):
     out, stats, kept = tmp_path / "box.exr", tmp_path / "box.json", tmp_path / "box.npz"
     assert main(["render", BOX, "-o", str(out), "--stats", str(stats), "--save", str(kept), *QUICK]) == 0
     numbers = json.loads(stats.read_text())
-    assert set(numbers) >= {"elements", "pairs", "rays", "oracle_rays", "iterations", "power", "seconds", "epsilon", "oracle", "alpha", "seed"}
+    assert set(numbers) >= {
+        "elements",
+        "pairs",
+        "rays",
+        "oracle_rays",
+        "iterations",
+        "power",
+        "seconds",
+        "epsilon",
+        "oracle",
+        "alpha",
+        "seed",
+    }
     assert set(numbers["power"]) == {"emitted", "absorbed", "escaped", "unshot"}
     assert set(numbers["seconds"]) == {"scene", "refine", "distribute", "total"}
     bitmap = mi.Bitmap(str(out))
@@ -27,7 +40,25 @@ def test_render_writes_what_it_is_asked_for(tmp_path, capsys):
 
 
 def test_all_views(tmp_path):
-    assert main(["render", "scenes_xml/office.xml", "-o", str(tmp_path / "office.png"), "--view", "all", "--elements", "1500", "--rays", "50000", "--spp", "1"]) == 0
+    assert (
+        main(
+            [
+                "render",
+                "scenes_xml/office.xml",
+                "-o",
+                str(tmp_path / "office.png"),
+                "--view",
+                "all",
+                "--elements",
+                "1500",
+                "--rays",
+                "50000",
+                "--spp",
+                "1",
+            ]
+        )
+        == 0
+    )
     assert sorted(p.name for p in tmp_path.iterdir()) == ["office_0.png", "office_1.png"]
 
 
@@ -47,28 +78,31 @@ def test_definitions(tmp_path):
     assert main(["info", str(file), "-D", "rho=1.5"]) == 2
 
 
-@pytest.mark.parametrize("arguments, says", [
-    (["render", "none.xml", "-o", "x.png"], "does not exist"),
-    (["render", "pyproject.toml", "-o", "x.png"], "cannot read"),
-    (["render", BOX, "-o", "x.jpg"], ".exr or .png"),
-    (["render", BOX, "-o", "nowhere/x.png"], "nowhere does not exist"),
-    (["render", BOX, "-o", "x.png", "--view", "1"], "1 sensor"),
-    (["render", BOX, "-o", "x.png", "--oracle", "delphi"], "unknown oracle"),
-    (["render", BOX, "-o", "x.png", "--oracle", "ks", "--alpha", "2"], "no alpha"),
-    (["render", BOX, "-o", "x.png", "--alpha", "0"], "greater than 0"),
-    (["render", BOX, "-o", "x.png", "--alpha", "nan"], "greater than 0"),
-    (["render", BOX, "-o", "x.png", "--elements", "0"], "greater than 0"),
-    (["render", BOX, "-o", "x.png", "--elements", "3"], "at least 12"),
-    (["render", BOX, "-o", "x.png", "--rays", "many"], "not a whole number"),
-    (["render", BOX, "-o", "x.png", "--shading", "toon"], "shading"),
-    (["render", BOX, "-o", "x.png", "--frobnicate"], "frobnicate"),
-    (["render", BOX, "-o", "x.png", "--load", "none.npz"], "none.npz does not exist"),
-    (["render", BOX, "-o", "x.png", "--load", "none.npz", "--rays", "9"], "leave out --rays"),
-    (["render", BOX, "-o", "x.png", "-m", "tabula_rasa"], "unknown variant"),
-    (["render", BOX, "-o", "x.png", "-m", "scalar_rgb"], "choose llvm_ad_rgb"),
-    (["info", BOX, "-D", "rho"], "KEY=VALUE"),
-    ([], "COMMAND"),
-])
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["render", "none.xml", "-o", "x.png"], "does not exist"),
+        (["render", "pyproject.toml", "-o", "x.png"], "cannot read"),
+        (["render", BOX, "-o", "x.jpg"], ".exr or .png"),
+        (["render", BOX, "-o", "nowhere/x.png"], "nowhere does not exist"),
+        (["render", BOX, "-o", "x.png", "--view", "1"], "1 sensor"),
+        (["render", BOX, "-o", "x.png", "--oracle", "delphi"], "unknown oracle"),
+        (["render", BOX, "-o", "x.png", "--oracle", "ks", "--alpha", "2"], "no alpha"),
+        (["render", BOX, "-o", "x.png", "--alpha", "0"], "greater than 0"),
+        (["render", BOX, "-o", "x.png", "--alpha", "nan"], "greater than 0"),
+        (["render", BOX, "-o", "x.png", "--elements", "0"], "greater than 0"),
+        (["render", BOX, "-o", "x.png", "--elements", "3"], "at least 12"),
+        (["render", BOX, "-o", "x.png", "--rays", "many"], "not a whole number"),
+        (["render", BOX, "-o", "x.png", "--shading", "toon"], "shading"),
+        (["render", BOX, "-o", "x.png", "--frobnicate"], "frobnicate"),
+        (["render", BOX, "-o", "x.png", "--load", "none.npz"], "none.npz does not exist"),
+        (["render", BOX, "-o", "x.png", "--load", "none.npz", "--rays", "9"], "leave out --rays"),
+        (["render", BOX, "-o", "x.png", "-m", "tabula_rasa"], "unknown variant"),
+        (["render", BOX, "-o", "x.png", "-m", "scalar_rgb"], "choose llvm_ad_rgb"),
+        (["info", BOX, "-D", "rho"], "KEY=VALUE"),
+        ([], "COMMAND"),
+    ],
+)
 def test_errors_are_one_line(arguments, says, capsys, monkeypatch, tmp_path):
     arguments = [str((tmp_path / a)) if a.startswith(("x.", "nowhere/")) else a for a in arguments]
     assert main(arguments) == 2
@@ -78,12 +112,15 @@ def test_errors_are_one_line(arguments, says, capsys, monkeypatch, tmp_path):
     mi.set_variant("llvm_ad_rgb")
 
 
-@pytest.mark.parametrize("body, says", [
-    ("<scene version='3.0.0'><shape", "cannot read"),
-    ("<scene version='3.0.0'><sensor type='perspective'/></scene>", "no shapes"),
-    ("<scene version='3.0.0'><sensor type='perspective'/><shape type='cube'/></scene>", "no light"),
-    ("<bsdf version='3.0.0' type='diffuse'/>", "scene file"),
-])
+@pytest.mark.parametrize(
+    "body, says",
+    [
+        ("<scene version='3.0.0'><shape", "cannot read"),
+        ("<scene version='3.0.0'><sensor type='perspective'/></scene>", "no shapes"),
+        ("<scene version='3.0.0'><sensor type='perspective'/><shape type='cube'/></scene>", "no light"),
+        ("<bsdf version='3.0.0' type='diffuse'/>", "scene file"),
+    ],
+)
 def test_bad_scenes(body, says, tmp_path, capsys):
     file = tmp_path / "bad.xml"
     file.write_text(body)
@@ -96,6 +133,7 @@ def test_bad_scenes(body, says, tmp_path, capsys):
 def test_interrupt(tmp_path, monkeypatch, capsys):
     def stop(*_, **__):
         raise KeyboardInterrupt
+
     monkeypatch.setattr("mi_radiosity.solver.solve", stop)
     assert main(["render", BOX, "-o", str(tmp_path / "x.png")]) == 130
     assert list(tmp_path.iterdir()) == [] and "interrupted" in capsys.readouterr().err
@@ -107,5 +145,6 @@ def test_interrupt_inside_a_loop_of_drjit(tmp_path, monkeypatch):
 
     def stop(*_):
         raise KeyboardInterrupt
+
     monkeypatch.setattr(elements, "child_at", stop)
     assert main(["render", BOX, "-o", str(tmp_path / "x.png"), *QUICK]) == 130

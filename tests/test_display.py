@@ -1,4 +1,5 @@
 """Pictures: continuity, the integrator, agreement with path, kept solutions."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,17 +24,24 @@ def test_the_field_is_continuous(solution):
 def test_the_field_stops_at_edges(solution):
     """Floor and wall do not share values where they meet."""
     points, normals, values, _ = border_values(solution)
-    key = np.round(points * 2 ** 14).astype(np.int64)
+    key = np.round(points * 2**14).astype(np.int64)
     order = np.lexsort(key.T)
-    same = (key[order][1:] == key[order][:-1]).all(axis=1) & (np.abs((normals[order][1:] * normals[order][:-1]).sum(axis=1)) < 0.5)
+    same = (key[order][1:] == key[order][:-1]).all(axis=1) & (
+        np.abs((normals[order][1:] * normals[order][:-1]).sum(axis=1)) < 0.5
+    )
     assert (np.abs(values[order][1:] - values[order][:-1]).max(axis=1)[same] > 1e-3).mean() > 0.5
 
 
 def test_a_constant_field_stays_constant():
     furnace = mi.load_file("scenes_xml/box_furnace.xml")
     solution = mr.solve(furnace, elements=600, rays=20_000)
-    solution.direct, solution.indirect = dr.full(mi.Color3f, 1, len(solution.elements)), dr.full(mi.Color3f, 2, len(solution.elements))
-    assert np.array(Field(solution).nodes).reshape(3, -1)[:, np.repeat(np.array(solution.elements.child) == 0, 6)] == pytest.approx(3, rel=1e-6)
+    solution.direct, solution.indirect = (
+        dr.full(mi.Color3f, 1, len(solution.elements)),
+        dr.full(mi.Color3f, 2, len(solution.elements)),
+    )
+    assert np.array(Field(solution).nodes).reshape(3, -1)[
+        :, np.repeat(np.array(solution.elements.child) == 0, 6)
+    ] == pytest.approx(3, rel=1e-6)
 
 
 @pytest.mark.parametrize("shading", ["gouraud", "flat"])
@@ -42,7 +50,10 @@ def test_picture_agrees_with_path(cornell, shading):
     ours = np.array(mr.solve(cornell, elements=6000, rays=1_000_000).render(spp=32, shading=shading))
     path = np.array(mi.render(cornell, integrator=mi.load_dict({"type": "path", "max_depth": -1}), spp=64))
     assert ours.mean() == pytest.approx(path.mean(), rel=0.01)
-    def blocks(image): return image.reshape(16, 16, 16, 16, 3).mean(axis=(1, 3))
+
+    def blocks(image):
+        return image.reshape(16, 16, 16, 16, 3).mean(axis=(1, 3))
+
     difference = np.abs(blocks(ours) - blocks(path))
     assert np.median(difference / blocks(path).clip(1e-3)) < 0.03
 
@@ -59,6 +70,7 @@ def test_outlines_darken(solution):
 
 def test_integrator_from_a_dictionary_solves_once(cornell, monkeypatch):
     from mi_radiosity.display import integrator as module
+
     calls = []
     monkeypatch.setattr(module, "solve", lambda *a, **k: calls.append(k) or mr.solve(*a, **k))
     plugin = mi.load_dict({"type": "radiosity", "oracle": "ks", "elements": 500, "rays": 20_000, "seed": 3})
@@ -74,14 +86,19 @@ def test_inside_aov_and_from_xml(tmp_path):
     file = tmp_path / "scene.xml"
     text = open("scenes_xml/box_furnace.xml").read()
     integrator = '<integrator type="aov"><string name="aovs" value="d:depth"/><integrator type="radiosity"><integer name="elements" value="100"/><integer name="rays" value="9000"/></integrator></integrator>'
-    file.write_text(text.replace('<integrator type="path"><integer name="max_depth" value="-1"/></integrator>', integrator))
+    file.write_text(
+        text.replace('<integrator type="path"><integer name="max_depth" value="-1"/></integrator>', integrator)
+    )
     image = np.array(mi.render(mi.load_file(str(file)), spp=4))
     assert image.shape == (64, 64, 4)
     assert image[..., :3].mean() == pytest.approx(2 / np.pi, rel=0.05) and image[..., 3].min() > 0
 
 
 def test_misses_are_black_and_finite():
-    plate = scene(lamp=rectangle(bsdf=diffuse(), emitter=lamp()), other=rectangle(mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(.2), bsdf=diffuse()))
+    plate = scene(
+        lamp=rectangle(bsdf=diffuse(), emitter=lamp()),
+        other=rectangle(mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.2), bsdf=diffuse()),
+    )
     image = np.array(mr.solve(plate, elements=20, rays=1000).render(spp=4))
     assert np.isfinite(image).all() and image[0, 0].max() == 0
 

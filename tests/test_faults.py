@@ -1,4 +1,5 @@
 """What goes wrong around a solve: threads, processes, interruptions, disks."""
+
 import os
 import re
 import signal
@@ -48,7 +49,10 @@ def test_threads_do_not_matter(cornell, threads, oracle):
 def test_processes_do_not_matter(tmp_path):
     """Two processes at the same time, one on one thread, give the same values to 1e-6."""
     files = [tmp_path / f"{k}.npy" for k in range(2)]
-    runs = [subprocess.Popen([sys.executable, "-c", SOLVE.format(threads=k + 1), str(f)], stderr=subprocess.PIPE) for k, f in enumerate(files)]
+    runs = [
+        subprocess.Popen([sys.executable, "-c", SOLVE.format(threads=k + 1), str(f)], stderr=subprocess.PIPE)
+        for k, f in enumerate(files)
+    ]
     for run in runs:
         _, said = run.communicate(timeout=300)
         assert run.returncode == 0, said.decode()
@@ -80,8 +84,10 @@ def test_a_full_disk_leaves_the_old_file(solution, tmp_path, monkeypatch, call):
 def test_a_device_that_is_really_full(solution, monkeypatch):
     """Bytes that do not fit are an error, not a short file."""
     import builtins
+
     def full(path, mode="r", *rest, **more):
         return real("/dev/full" if "w" in mode else path, mode, *rest, **more)
+
     real = builtins.open
     monkeypatch.setattr("mi_radiosity.solver.solution.open", full, raising=False)
     with pytest.raises(mr.RadiosityError, match="No space left"):
@@ -89,17 +95,17 @@ def test_a_device_that_is_really_full(solution, monkeypatch):
     assert not os.path.exists("never.npz")
 
 
-@pytest.mark.parametrize("share", [0, .01, .3, .9, .999])
+@pytest.mark.parametrize("share", [0, 0.01, 0.3, 0.9, 0.999])
 def test_truncated_solutions_are_refused(solution, cornell, tmp_path, share):
     file = tmp_path / "kept.npz"
     solution.save(file)
     whole = file.read_bytes()
-    file.write_bytes(whole[:int(share * len(whole))])
+    file.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(mr.RadiosityError, match="not a readable solution"):
         mr.Solution.load(file, cornell)
 
 
-@pytest.mark.parametrize("byte", [.2, .4, .6, .8])
+@pytest.mark.parametrize("byte", [0.2, 0.4, 0.6, 0.8])
 def test_damaged_solutions_are_refused(solution, cornell, tmp_path, byte):
     """A flipped byte inside of an array does not pass for data."""
     file = tmp_path / "kept.npz"
@@ -143,21 +149,33 @@ def test_an_interrupted_save_keeps_the_old_file(solution, tmp_path, monkeypatch)
     file = tmp_path / "kept.npz"
     solution.save(file)
     before = file.read_bytes()
-    def interrupt(*args, **kwargs): raise KeyboardInterrupt
+
+    def interrupt(*args, **kwargs):
+        raise KeyboardInterrupt
+
     monkeypatch.setattr("numpy.savez_compressed", interrupt)
     with pytest.raises(KeyboardInterrupt):
         solution.save(file)
     assert os.listdir(tmp_path) == ["kept.npz"] and file.read_bytes() == before
 
 
-CLI = [sys.executable, "-c", "import sys; from mi_radiosity.cli import main; print('ready', flush=True); sys.exit(main())"]
+CLI = [
+    sys.executable,
+    "-c",
+    "import sys; from mi_radiosity.cli import main; print('ready', flush=True); sys.exit(main())",
+]
 BOX = "scenes_xml/cornell_box.xml"
 
 
 @pytest.mark.parametrize("seconds", [0.2, 4.0])
 def test_a_real_interrupt(tmp_path, seconds):
     """SIGINT while the scene loads and while rays are cast: exit status 130, one line, no traceback, nothing half-written."""
-    run = subprocess.Popen([*CLI, "render", BOX, "-o", str(tmp_path / "x.exr"), "--rays", "2000000000"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = subprocess.Popen(
+        [*CLI, "render", BOX, "-o", str(tmp_path / "x.exr"), "--rays", "2000000000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     assert run.stdout.readline() == "ready\n"
     time.sleep(seconds)
     run.send_signal(signal.SIGINT)
@@ -171,7 +189,11 @@ def small_box(tmp_path):
     """The Cornell box as a scene file with a film of 32 × 32."""
     file = tmp_path / "box.xml"
     with open(BOX, encoding="utf-8") as box:
-        text = box.read().replace('value="256"', 'value="32"').replace('"meshes/', f'"{os.path.abspath("scenes_xml")}/meshes/')
+        text = (
+            box.read()
+            .replace('value="256"', 'value="32"')
+            .replace('"meshes/', f'"{os.path.abspath("scenes_xml")}/meshes/')
+        )
     file.write_text(text, encoding="utf-8")
     return file
 
@@ -179,13 +201,24 @@ def small_box(tmp_path):
 def test_two_processes_on_one_reference(small_box, tmp_path):
     """Both end well, the file is whole and has the samples the greedier one asked for."""
     file = tmp_path / "ref.exr"
-    runs = [subprocess.Popen([*CLI, "reference", str(small_box), "-o", str(file), "--spp", str(spp)], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-            for spp in (512, 4096)]
+    runs = [
+        subprocess.Popen(
+            [*CLI, "reference", str(small_box), "-o", str(file), "--spp", str(spp)],
+            stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            text=True,
+        )
+        for spp in (512, 4096)
+    ]
     for run in runs:
         _, said = run.communicate(timeout=300)
         assert run.returncode == 0, said
     reference = Reference.load(file)
-    assert reference.image().shape == (32, 32, 3) and sum(reference.spp) == 4096 and sorted(os.listdir(tmp_path)) == ["box.xml", "ref.exr"]
+    assert (
+        reference.image().shape == (32, 32, 3)
+        and sum(reference.spp) == 4096
+        and sorted(os.listdir(tmp_path)) == ["box.xml", "ref.exr"]
+    )
 
 
 def test_work_of_another_process_is_not_undone(small_box, tmp_path):
@@ -193,10 +226,12 @@ def test_work_of_another_process_is_not_undone(small_box, tmp_path):
     file, ahead, seen = tmp_path / "ref.exr", tmp_path / "ahead.exr", []
     scene = mi.load_file(str(small_box))
     render_reference(scene, scene.sensors()[0], ahead, spp=512)
+
     def progress(done, total):
         seen.append(done)
         if done == 64:
             os.replace(ahead, file)
+
     found = render_reference(scene, scene.sensors()[0], file, spp=640, progress=progress)
     assert seen == [64, 128, 576, 640] and sum(found.spp) == sum(Reference.load(file).spp) == 640
 
@@ -204,7 +239,10 @@ def test_work_of_another_process_is_not_undone(small_box, tmp_path):
 def test_a_plugin_that_was_interrupted_solves_again(cornell):
     """No half-done solution is shown afterwards."""
     plugin = mi.load_dict({"type": "radiosity", "elements": 500, "rays": 20_000})
-    def interrupt(*args): raise KeyboardInterrupt
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
     plugin.progress = interrupt
     with pytest.raises(KeyboardInterrupt):
         plugin.prepare(cornell)

@@ -1,4 +1,5 @@
 """Form factors from the package's own kernel and rays against closed forms."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -9,15 +10,15 @@ from scipy import stats
 import mi_radiosity as mr
 from mi_radiosity.scene import Model
 from mi_radiosity.scene.model import NONE
-from mi_radiosity.scene.sampling import kronecker, triangle
-from mi_radiosity.solver.elements import Elements
-from mi_radiosity.solver.pairs import Pairs
+from mi_radiosity.core.points import kronecker, triangle
+from mi_radiosity.mesh.elements import Elements
+from mi_radiosity.mesh.pairs import Pairs
 
-A, B, OTHER = 0.1, 0.2, 0.3             # reflectances that name the two plates and what stands between
-C11 = {(1, 1): 0.19982489569838, (2, 1): 0.28587538485071, (.5, 4): 0.1985885560012}
-C14 = {(1, 1): 0.2000437760754, (2, 1): 0.23285260279536, (.5, 3): 0.053268159377407}
-C41 = {(1, 1): 0.38196601125011, (.5, 1.5): 0.67544467966324, (2, .25): 0.012468514652959}
-B3 = {(1, 1): 0.13853160599489, (.5, 2): 0.10683787830885, (5, 3): 0.23501869605971}
+A, B, OTHER = 0.1, 0.2, 0.3  # reflectances that name the two plates and what stands between
+C11 = {(1, 1): 0.19982489569838, (2, 1): 0.28587538485071, (0.5, 4): 0.1985885560012}
+C14 = {(1, 1): 0.2000437760754, (2, 1): 0.23285260279536, (0.5, 3): 0.053268159377407}
+C41 = {(1, 1): 0.38196601125011, (0.5, 1.5): 0.67544467966324, (2, 0.25): 0.012468514652959}
+B3 = {(1, 1): 0.13853160599489, (0.5, 2): 0.10683787830885, (5, 3): 0.23501869605971}
 SEEDS = 24
 T = mi.ScalarTransform4f
 
@@ -25,7 +26,9 @@ T = mi.ScalarTransform4f
 def parallel(x, y, c=1.0, **others):
     """Rectangles x × y that face each other over the distance c."""
     a = np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]])
-    return Model(scene(a=quad(a, bsdf=diffuse(A)), b=quad(a[::-1] + [0, 0, c], bsdf=diffuse(B), emitter=lamp()), **others))
+    return Model(
+        scene(a=quad(a, bsdf=diffuse(A)), b=quad(a[::-1] + [0, 0, c], bsdf=diffuse(B), emitter=lamp()), **others)
+    )
 
 
 def hinged(degrees, h=1.0, w=1.0):
@@ -40,8 +43,8 @@ def hinged(degrees, h=1.0, w=1.0):
 def contour(p, q, nodes=160):
     """A_p F_pq of polygons that see each other fully, by Stokes: ∮∮ ln r dx·dy / 2π, one integral in closed form."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
-    t = (x + 1) / 2         # graded towards the ends, where ln r is singular if edges touch
-    x, weight = t ** 3 * (10 - 15 * t + 6 * t * t), weight / 2 * 30 * (t * (1 - t)) ** 2
+    t = (x + 1) / 2  # graded towards the ends, where ln r is singular if edges touch
+    x, weight = t**3 * (10 - 15 * t + 6 * t * t), weight / 2 * 30 * (t * (1 - t)) ** 2
     total = 0
     for a, b in zip(p, np.roll(p, -1, axis=0)):
         points = a + (b - a) * x[:, None]
@@ -50,7 +53,10 @@ def contour(p, q, nodes=160):
             along = (d - c) / length
             s = (c - points) @ along
             h = np.linalg.norm(c - points - s[:, None] * along, axis=1) + 1e-300
-            def primitive(s): return s / 2 * np.log(s * s + h * h) - s + h * np.arctan(s / h)
+
+            def primitive(s):
+                return s / 2 * np.log(s * s + h * h) - s + h * np.arctan(s / h)
+
             total += weight @ (primitive(s + length) - primitive(s)) * ((b - a) @ along)
     return total / (2 * np.pi)
 
@@ -63,14 +69,17 @@ def estimates(model, lines, seeds=SEEDS, first_seed=0):
     for seed in range(first_seed, first_seed + seeds):
         pairs = Pairs(Elements(model), mr.GMI(), lines, seed)
         pairs.add_roots(mi.UInt32(i), mi.UInt32(j))
-        F = np.array(pairs.kernel_samples(pairs.find_roots(mi.UInt32(i), mi.UInt32(j), dr.full(mi.Bool, True, len(i)))), dtype=float)
+        F = np.array(
+            pairs.kernel_samples(pairs.find_roots(mi.UInt32(i), mi.UInt32(j), dr.full(mi.Bool, True, len(i)))),
+            dtype=float,
+        )
         results.append((F.reshape(-1, lines).mean(axis=1) * area[i] * area[j]).sum() / area[a].sum())
     return np.array(results)
 
 
 def agree(values, exact):
     """Is ``exact`` in the 99.9 % t-interval of independent estimates?"""
-    half = stats.t.ppf(0.9995, len(values) - 1) * values.std(ddof=1) / len(values) ** .5
+    half = stats.t.ppf(0.9995, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5
     assert abs(values.mean() - exact) <= half, f"{values.mean():.9f} ± {half:.1e} is not {exact:.9f}"
 
 
@@ -87,7 +96,7 @@ def by_rays(model, rays, seed=0):
     """F_AB as the share of rays from A that meet B, and its standard error."""
     a, area = group(model, A), np.array(model.area)
     share = np.isin(rays_from(model, a, rays, seed), group(model, B)).mean(axis=1) @ area[a] / area[a].sum()
-    return share, (share * (1 - share) / (rays * len(a))) ** .5
+    return share, (share * (1 - share) / (rays * len(a))) ** 0.5
 
 
 @pytest.mark.parametrize("x, y", C11)
@@ -111,12 +120,21 @@ def test_convergence_is_that_of_random_lines_or_better():
 @pytest.mark.parametrize("r1, r2", C41)
 def test_coaxial_disks(r1, r2):
     """Disks are 32-gons of their area: within 2e-4 of the round ones, and exact for what they are."""
-    disks = Model(scene(a={"type": "disk", "to_world": T().scale([r1, r1, 1]), "bsdf": diffuse(A)},
-                        b={"type": "disk", "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale([r2, r2, 1]), "bsdf": diffuse(B), "emitter": lamp()}))
+    disks = Model(
+        scene(
+            a={"type": "disk", "to_world": T().scale([r1, r1, 1]), "bsdf": diffuse(A)},
+            b={
+                "type": "disk",
+                "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale([r2, r2, 1]),
+                "bsdf": diffuse(B),
+                "emitter": lamp(),
+            },
+        )
+    )
     turn = np.arange(32) / 32 * 2 * np.pi
     equal_area = np.sqrt(2 * np.pi / 32 / np.sin(2 * np.pi / 32))
     ring = equal_area * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
-    polygons = contour(ring * r1, (ring * r2)[::-1] + [0, 0, 1], 12) / (np.pi * r1 ** 2)
+    polygons = contour(ring * r1, (ring * r2)[::-1] + [0, 0, 1], 12) / (np.pi * r1**2)
     assert polygons == pytest.approx(C41[r1, r2], rel=2e-4)
     agree(estimates(disks, 300), polygons)
 
@@ -125,7 +143,7 @@ def test_coaxial_disks(r1, r2):
 def test_point_to_rectangle(a, b):
     """The kernel from one point under a corner of a rectangle."""
     model = parallel(a, b)
-    corners = np.array([np.array(model.corner(k)).T for k in range(3)])             # [3, patches, 3]
+    corners = np.array([np.array(model.corner(k)).T for k in range(3)])  # [3, patches, 3]
     k, i = next((k, i) for i in group(model, A) for k in range(3) if not corners[k, i].any())
     n, targets, values = 4096, group(model, B), []
     for seed in range(SEEDS):
@@ -136,17 +154,33 @@ def test_point_to_rectangle(a, b):
     agree(np.array(values), B3[a, b])
 
 
-@pytest.mark.parametrize("width, exact", [(.5, 0.14986867177379), (1.0, 0.099912447849194), (0.0, C11[1, 1])], ids=["quarter", "half", "none"])
+@pytest.mark.parametrize(
+    "width, exact",
+    [(0.5, 0.14986867177379), (1.0, 0.099912447849194), (0.0, C11[1, 1])],
+    ids=["quarter", "half", "none"],
+)
 def test_occluded(width, exact):
     """A plate half-way covers a quarter or a half of what the squares see of each other."""
-    between = {"plate": quad(np.array([[0, 0, .5], [width, 0, .5], [width, .5, .5], [0, .5, .5]]), bsdf=diffuse(OTHER, two_sided=True))} if width else {}
+    between = (
+        {
+            "plate": quad(
+                np.array([[0, 0, 0.5], [width, 0, 0.5], [width, 0.5, 0.5], [0, 0.5, 0.5]]),
+                bsdf=diffuse(OTHER, two_sided=True),
+            )
+        }
+        if width
+        else {}
+    )
     model = parallel(1, 1, **between)
     agree(estimates(model, 20_000), exact)
     share, error = by_rays(model, 100_000)
     assert abs(share - exact) < 4 * error
 
 
-@pytest.mark.parametrize("degrees, h, w, exact", [*((90, h, w, f) for (h, w), f in C14.items()), (10, 1, 1, None), (179, 1, 1, None), (1, 1, 1, None)])
+@pytest.mark.parametrize(
+    "degrees, h, w, exact",
+    [*((90, h, w, f) for (h, w), f in C14.items()), (10, 1, 1, None), (179, 1, 1, None), (1, 1, 1, None)],
+)
 def test_touching_patches(degrees, h, w, exact):
     """F is unbounded and its variance infinite: σ is finite, rays are right to four standard errors, lines to 2 %."""
     model, stokes = hinged(degrees, h, w)
@@ -166,9 +200,17 @@ def test_touching_patches(degrees, h, w, exact):
 
 def room():
     """A closed room with two boxes, one turned."""
-    return Model(scene(room={"type": "cube", "flip_normals": True, "bsdf": diffuse(A), "emitter": lamp()},
-                       one={"type": "cube", "to_world": T().translate([.3, -.6, .2]).scale(.3), "bsdf": diffuse(B)},
-                       two={"type": "cube", "to_world": T().translate([-.4, .1, -.3]).rotate([0, 0.6, 0.8], 40).scale(.35), "bsdf": diffuse(OTHER)}))
+    return Model(
+        scene(
+            room={"type": "cube", "flip_normals": True, "bsdf": diffuse(A), "emitter": lamp()},
+            one={"type": "cube", "to_world": T().translate([0.3, -0.6, 0.2]).scale(0.3), "bsdf": diffuse(B)},
+            two={
+                "type": "cube",
+                "to_world": T().translate([-0.4, 0.1, -0.3]).rotate([0, 0.6, 0.8], 40).scale(0.35),
+                "bsdf": diffuse(OTHER),
+            },
+        )
+    )
 
 
 def test_closed_scenes_lose_no_ray():
@@ -193,8 +235,16 @@ def test_nothing_to_refine_inside_a_sphere(oracle):
     """F is constant in a sphere, but for facets that touch: where a box of its area is split again and again, fewer than 1 % of 1,280 facets are."""
     vertices, faces = icosphere(3)
     ball = scene(ball=mesh(vertices, faces, diffuse(A), lamp()))
-    side = (4 * np.pi / 6) ** .5
-    box = scene(box={"type": "cube", "flip_normals": True, "to_world": T().scale(side / 2), "bsdf": diffuse(A), "emitter": lamp()})
+    side = (4 * np.pi / 6) ** 0.5
+    box = scene(
+        box={
+            "type": "cube",
+            "flip_normals": True,
+            "to_world": T().scale(side / 2),
+            "bsdf": diffuse(A),
+            "emitter": lamp(),
+        }
+    )
     ball, box = (mr.solve(s, oracle, epsilon=1e-5, rays=10_000).stats for s in (ball, box))
     assert ball["elements"] < 1.01 * ball["patches"] and ball["pairs"] > 60_000
     assert box["elements"] > 10 * box["patches"]

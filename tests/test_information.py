@@ -1,4 +1,5 @@
 """information_gap, the kernel of every GMI oracle, against 60-digit arithmetic."""
+
 import mitsuba as mi
 import mpmath
 import numpy as np
@@ -8,7 +9,7 @@ import mi_radiosity as mr
 
 PAIRS, LINES = 40, 10
 ALPHAS = [0.01, 0.1, 0.25, 0.5, 0.75, 0.9, 1, 1.1, 1.25, 1.5, 2, 2.5, 3, 3.7, 5]
-NEAR_ONE = [1 + sign * 10.0 ** -k for k in (2, 3, 4, 5, 6, 7, 8, 10, 12) for sign in (1, -1)]
+NEAR_ONE = [1 + sign * 10.0**-k for k in (2, 3, 4, 5, 6, 7, 8, 10, 12) for sign in (1, -1)]
 
 
 def exact(F, alpha):
@@ -25,7 +26,7 @@ def exact(F, alpha):
                 elif a == 1:
                     gaps.append(float(mpmath.fsum(x * mpmath.log(x) for x in f if x > 0) / len(f) - m * mpmath.log(m)))
                 else:
-                    gaps.append(float((m ** a - mpmath.fsum(x ** a for x in f if x > 0) / len(f)) / (1 - a)))
+                    gaps.append(float((m**a - mpmath.fsum(x**a for x in f if x > 0) / len(f)) / (1 - a)))
             return np.array(gaps)
 
 
@@ -53,9 +54,20 @@ def with_zeros():
     return F
 
 
-CASES = {"spread 1": spread(.999), "spread 0.1": spread(.1), "spread 1/32": spread(1 / 32), "spread 0.01": spread(.01), "spread 1e-4": spread(1e-4),
-         "spread 1e-6": spread(1e-6), "mixed": mixed(), "one scale": one_scale(), "zeros": with_zeros(),
-         "extremes": np.array([[1e-30, 1e30], [1e30, 1e30 * (1 + 1e-6)], [1e-30, 1e-30 * (1 + 1e-6)], [0, 1e-30], [0, 1e30]])}
+CASES = {
+    "spread 1": spread(0.999),
+    "spread 0.1": spread(0.1),
+    "spread 1/32": spread(1 / 32),
+    "spread 0.01": spread(0.01),
+    "spread 1e-4": spread(1e-4),
+    "spread 1e-6": spread(1e-6),
+    "mixed": mixed(),
+    "one scale": one_scale(),
+    "zeros": with_zeros(),
+    "extremes": np.array(
+        [[1e-30, 1e30], [1e30, 1e30 * (1 + 1e-6)], [1e-30, 1e-30 * (1 + 1e-6)], [0, 1e-30], [0, 1e30]]
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
@@ -65,7 +77,9 @@ def test_agrees_with_sixty_digits(name, kind):
     F = CASES[name].astype(kind)
     for alpha in ALPHAS + NEAR_ONE:
         reference = exact(F, alpha)
-        np.testing.assert_allclose(np.array(mr.information_gap(F, alpha)), reference, rtol=1e-9, atol=0, err_msg=f"alpha = {alpha!r}")
+        np.testing.assert_allclose(
+            np.array(mr.information_gap(F, alpha)), reference, rtol=1e-9, atol=0, err_msg=f"alpha = {alpha!r}"
+        )
 
 
 @pytest.mark.parametrize("alpha", ALPHAS + NEAR_ONE)
@@ -92,7 +106,10 @@ def test_continuous_in_alpha(name):
     logs = np.abs(np.log(F[F > 0])).max()
     for alpha in [0.3, 1 - 2e-9, 1 - 1e-9, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-9, 2]:
         here, there = (np.array(mr.information_gap(F, a)) for a in (alpha, alpha + 1e-9))
-        assert np.abs(there - here).max() == 0 or (np.abs(there - here) <= 1e-9 * 10 * logs * np.maximum(here, there)).all()
+        assert (
+            np.abs(there - here).max() == 0
+            or (np.abs(there - here) <= 1e-9 * 10 * logs * np.maximum(here, there)).all()
+        )
 
 
 def test_mutual_information_is_the_limit():

@@ -1,4 +1,5 @@
 """The notebooks run from start to end, on small budgets."""
+
 from pathlib import Path
 
 import nbformat

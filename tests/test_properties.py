@@ -1,7 +1,20 @@
 """Three hundred random scenes and what must hold in all of them."""
+
 import mitsuba as mi
 import numpy as np
-from conftest import ORACLES, balance, diffuse, gaps_between_leaves, icosphere, lamp, leaf_values, mesh, partition, rectangle, scene
+from conftest import (
+    ORACLES,
+    balance,
+    diffuse,
+    gaps_between_leaves,
+    icosphere,
+    lamp,
+    leaf_values,
+    mesh,
+    partition,
+    rectangle,
+    scene,
+)
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
@@ -20,7 +33,7 @@ def numbers(low, high):
 def placements(draw):
     """A turn, a size per axis, a mirror perhaps, and a place in or about the room."""
     axis = np.array(draw(st.tuples(*3 * [numbers(-1, 1)]))) + [0, 0, 1.5]
-    size = np.array(draw(st.tuples(*3 * [numbers(.05, .6)]))) * draw(st.sampled_from([1, -1]))
+    size = np.array(draw(st.tuples(*3 * [numbers(0.05, 0.6)]))) * draw(st.sampled_from([1, -1]))
     place = draw(st.tuples(*3 * [numbers(-1.2, 1.2)]))
     axis = axis / np.linalg.norm(axis)
     return mi.ScalarTransform4f().translate(list(place)).rotate(list(axis), draw(numbers(0, 360))).scale(list(size))
@@ -30,12 +43,17 @@ def placements(draw):
 def shapes(draw):
     """A box, a triangle ball, a plate, or a plate in the plane of the floor, one- or two-sided, dark or lit."""
     kind = draw(st.sampled_from(["box", "ball", "plate", "rug"]))
-    bsdf = diffuse(draw(st.sampled_from([0.0, .2, .5, .8, .95])), two_sided=draw(st.booleans()))
-    emitter = {"emitter": lamp(draw(st.sampled_from([.01, 1, 1000])))} if draw(st.integers(0, 3)) == 0 else {}
+    bsdf = diffuse(draw(st.sampled_from([0.0, 0.2, 0.5, 0.8, 0.95])), two_sided=draw(st.booleans()))
+    emitter = {"emitter": lamp(draw(st.sampled_from([0.01, 1, 1000])))} if draw(st.integers(0, 3)) == 0 else {}
     to_world = draw(placements())
     if kind == "rug":
-        x, y, size = (draw(numbers(*ends)) for ends in ((-.8, .8), (-.8, .8), (.1, .7)))
-        to_world = mi.ScalarTransform4f().translate([x, y, -1]).rotate([0, 0, 1], draw(st.sampled_from([0, 90, 30]))).scale([size, .3, 1])
+        x, y, size = (draw(numbers(*ends)) for ends in ((-0.8, 0.8), (-0.8, 0.8), (0.1, 0.7)))
+        to_world = (
+            mi.ScalarTransform4f()
+            .translate([x, y, -1])
+            .rotate([0, 0, 1], draw(st.sampled_from([0, 90, 30])))
+            .scale([size, 0.3, 1])
+        )
     if kind == "ball":
         vertices, faces = BALLS[draw(st.integers(0, 1))]
         matrix = np.array(to_world.matrix)
@@ -48,19 +66,21 @@ def scenes(draw):
     """Up to five shapes and a lamp, in a closed room or in the open."""
     parts = {f"shape{k}": shape for k, shape in enumerate(draw(st.lists(shapes(), max_size=5)))}
     if draw(st.booleans()):
-        parts["room"] = {"type": "cube", "flip_normals": True, "bsdf": diffuse(draw(st.sampled_from([.1, .5, .9])))}
-    parts["lamp"] = rectangle(draw(placements()), bsdf=diffuse(.5), emitter=lamp(draw(st.sampled_from([.1, 1, 10]))))
+        parts["room"] = {"type": "cube", "flip_normals": True, "bsdf": diffuse(draw(st.sampled_from([0.1, 0.5, 0.9])))}
+    parts["lamp"] = rectangle(draw(placements()), bsdf=diffuse(0.5), emitter=lamp(draw(st.sampled_from([0.1, 1, 10]))))
     return scene(optimize=False, **parts)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
-@given(scenes(), st.sampled_from(ORACLES), st.integers(0, 2 ** 32 - 1))
+@settings(
+    max_examples=300, deadline=None, derandomize=True, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+)
+@given(scenes(), st.sampled_from(ORACLES), st.integers(0, 2**32 - 1))
 def test_any_scene(parts, oracle, seed):
     """Energy kept, B ≥ 0 and finite, leaves partition patches, children fill parents, the picture has no cracks."""
     model = Model(parts)
     try:
         solution = mr.solve(model, oracle, elements=model.count + 150, rays=4000, seed=seed)
-    except mr.RadiosityError as error:      # nothing near a lone lamp
+    except mr.RadiosityError as error:  # nothing near a lone lamp
         assert "nothing left to refine" in str(error)
         solution = mr.solve(model, oracle, epsilon=1e-3, rays=4000, seed=seed)
     assert abs(balance(solution) - 1) < 1e-3
@@ -72,4 +92,4 @@ def test_any_scene(parts, oracle, seed):
     np.testing.assert_allclose(area[child[inner, None] + np.arange(4)].sum(axis=1), area[inner], rtol=1e-6)
     # Where a wall stands across an element, rounding may decide which side a point of its border is on.
     cracks = (gaps_between_leaves(solution) > 1e-4).mean()
-    assert cracks <= (.02 if np.array(Field(solution).walled).any() else 0)
+    assert cracks <= (0.02 if np.array(Field(solution).walled).any() else 0)

@@ -1,4 +1,5 @@
 """Patches: what is modelled, on which side, and what is refused by name."""
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -16,16 +17,25 @@ def over(floor):
 
 def test_back_sides_only_where_light_can_reach():
     one, two = (Model(over(rectangle(bsdf=diffuse(two_sided=t)))) for t in (False, True))
-    assert one.count == two.count == 4          # the back of the floor sees nothing
-    between = scene(a=rectangle(bsdf=diffuse(two_sided=True)),
-                    lamp=rectangle(mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(), emitter=lamp()),
-                    below=rectangle(mi.ScalarTransform4f().translate([1, 0, -1]).scale(2), bsdf=diffuse()))
-    assert Model(between).count == 8            # here it sees a floor that the lamp lights
+    assert one.count == two.count == 4  # the back of the floor sees nothing
+    between = scene(
+        a=rectangle(bsdf=diffuse(two_sided=True)),
+        lamp=rectangle(
+            mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(), emitter=lamp()
+        ),
+        below=rectangle(mi.ScalarTransform4f().translate([1, 0, -1]).scale(2), bsdf=diffuse()),
+    )
+    assert Model(between).count == 8  # here it sees a floor that the lamp lights
 
 
 def test_unlit_rooms_cost_nothing():
     lit = {"type": "cube", "flip_normals": True, "bsdf": diffuse(), "emitter": lamp()}
-    dark = {"type": "cube", "flip_normals": True, "bsdf": diffuse(), "to_world": mi.ScalarTransform4f().translate([5, 0, 0])}
+    dark = {
+        "type": "cube",
+        "flip_normals": True,
+        "bsdf": diffuse(),
+        "to_world": mi.ScalarTransform4f().translate([5, 0, 0]),
+    }
     model = Model(scene(lit=lit, dark=dark))
     assert (model.count, model.unreached) == (12, 12)
 
@@ -38,8 +48,17 @@ def test_patches_have_the_units_of_the_paper():
 
 
 def test_disks_keep_their_area():
-    model = Model(scene(lamp={"type": "disk", "bsdf": diffuse(), "emitter": lamp(2), "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 180)},
-                        floor=rectangle(mi.ScalarTransform4f().translate([0, 0, -1]).scale(3), bsdf=diffuse())))
+    model = Model(
+        scene(
+            lamp={
+                "type": "disk",
+                "bsdf": diffuse(),
+                "emitter": lamp(2),
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 180),
+            },
+            floor=rectangle(mi.ScalarTransform4f().translate([0, 0, -1]).scale(3), bsdf=diffuse()),
+        )
+    )
     emission, area = np.array(model.emission)[0], np.array(model.area)
     assert area[emission > 0].sum() == pytest.approx(np.pi, rel=1e-5)
     assert np.array(model.normal)[2][emission > 0] == pytest.approx(-1)
@@ -48,36 +67,65 @@ def test_disks_keep_their_area():
 def test_normals_follow_the_shading_side():
     mirrored = mi.ScalarTransform4f().scale([1, 1, -1])
     for to_world in (mi.ScalarTransform4f(), mirrored):
-        model = Model(scene(box={"type": "cube", "flip_normals": True, "to_world": to_world, "bsdf": diffuse(), "emitter": lamp()}))
+        model = Model(
+            scene(
+                box={"type": "cube", "flip_normals": True, "to_world": to_world, "bsdf": diffuse(), "emitter": lamp()}
+            )
+        )
         centroid = np.array(model.p0) + (np.array(model.e1) + np.array(model.e2)) / 3
         assert ((np.array(model.normal) * centroid).sum(axis=0) < 0).all()
 
 
 def test_textures_give_each_element_its_own_reflectance():
-    checker = {"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": {"type": "rgb", "value": 0.1}, "color1": {"type": "rgb", "value": 0.9},
-                                                  "to_uv": mi.ScalarTransform4f().scale([2, 2, 1])}}
+    checker = {
+        "type": "diffuse",
+        "reflectance": {
+            "type": "checkerboard",
+            "color0": {"type": "rgb", "value": 0.1},
+            "color1": {"type": "rgb", "value": 0.9},
+            "to_uv": mi.ScalarTransform4f().scale([2, 2, 1]),
+        },
+    }
     solution = mr.solve(over(rectangle(bsdf=checker)), mr.Uniform(), elements=1000, rays=20_000)
     rho = np.array(solution.elements.reflectance)[0]
-    leaves = (np.array(solution.elements.child) == 0) & (np.array(solution.model.normal)[2][np.array(solution.elements.patch)] > 0)
+    leaves = (np.array(solution.elements.child) == 0) & (
+        np.array(solution.model.normal)[2][np.array(solution.elements.patch)] > 0
+    )
     assert rho[leaves].min() == pytest.approx(0.1) and rho[leaves].max() == pytest.approx(0.9)
     assert rho[leaves].mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_fingerprint_ignores_the_order_of_shapes():
-    floor, small = rectangle(bsdf=diffuse()), rectangle(mi.ScalarTransform4f().translate([0, 0, .5]).scale(.1), bsdf=diffuse(0.2))
+    floor, small = (
+        rectangle(bsdf=diffuse()),
+        rectangle(mi.ScalarTransform4f().translate([0, 0, 0.5]).scale(0.1), bsdf=diffuse(0.2)),
+    )
     up = rectangle(mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(), emitter=lamp())
     a, b = Model(scene(a=floor, b=small, c=up)), Model(scene(a=up, b=floor, c=small))
     assert a.fingerprint == b.fingerprint
     np.testing.assert_array_equal(np.array(a.p0), np.array(b.p0))
 
 
-@pytest.mark.parametrize("shape, says", [
-    ({"type": "sphere", "id": "ball", "bsdf": diffuse()}, "ball"),
-    (rectangle(id="mirror", bsdf={"type": "conductor"}), "mirror.*SmoothConductor"),
-    (rectangle(id="bright", bsdf=diffuse(1.0)), "bright.*less than 1"),
-    (rectangle(id="lit", emitter={"type": "area", "radiance": {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.ones((2, 2, 3), np.float32))}}), "lit.*textured"),
-    ({"type": "constant", "id": "sky"}, "sky.*area"),
-], ids=["sphere", "conductor", "white", "textured lamp", "environment"])
+@pytest.mark.parametrize(
+    "shape, says",
+    [
+        ({"type": "sphere", "id": "ball", "bsdf": diffuse()}, "ball"),
+        (rectangle(id="mirror", bsdf={"type": "conductor"}), "mirror.*SmoothConductor"),
+        (rectangle(id="bright", bsdf=diffuse(1.0)), "bright.*less than 1"),
+        (
+            rectangle(
+                id="lit",
+                emitter={
+                    "type": "area",
+                    "radiance": {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.ones((2, 2, 3), np.float32))},
+                },
+            ),
+            "lit.*textured",
+        ),
+        ({"type": "constant", "id": "sky"}, "sky.*area"),
+    ],
+    ids=["sphere", "conductor", "white", "textured lamp", "environment"],
+)
 def test_refused_by_name(shape, says):
     bad = over(shape)
     with pytest.raises(mr.RadiosityError, match=says):

@@ -1,4 +1,5 @@
 """solve(): budgets, energy, determinism, closed solutions, oracles of one's own, refusals."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -54,7 +55,10 @@ def test_same_seed_same_solution(cornell):
 def test_direct_and_indirect_are_apart():
     """A lamp over a floor that reflects: only the floor is lit directly, and only by the lamp."""
     T = mi.ScalarTransform4f
-    plates = scene(floor=rectangle(bsdf=diffuse(0.5)), lamp=rectangle(T().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(0.5), emitter=lamp()))
+    plates = scene(
+        floor=rectangle(bsdf=diffuse(0.5)),
+        lamp=rectangle(T().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(0.5), emitter=lamp()),
+    )
     solution = mr.solve(plates, elements=200, rays=400_000)
     direct, indirect = np.array(solution.direct)[0], np.array(solution.indirect)[0]
     emits = np.array(dr.max(solution.model.emission) > 0)[np.array(solution.elements.patch)]
@@ -70,8 +74,11 @@ def test_direct_and_indirect_are_apart():
 def test_what_lies_inside_solids_is_left_out():
     """A box of 1 × 1 m on a floor of 2 × 2 m leaves 3 m² of it open; power goes there, none is lost inside."""
     T = mi.ScalarTransform4f
-    room = scene(floor=rectangle(bsdf=diffuse(0.9)), box={"type": "cube", "to_world": T().translate([0.1, 0.1, 0.5]).scale(0.5), "bsdf": diffuse(0.5)},
-                 lamp=rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180), bsdf=diffuse(0.5), emitter=lamp()))
+    room = scene(
+        floor=rectangle(bsdf=diffuse(0.9)),
+        box={"type": "cube", "to_world": T().translate([0.1, 0.1, 0.5]).scale(0.5), "bsdf": diffuse(0.5)},
+        lamp=rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180), bsdf=diffuse(0.5), emitter=lamp()),
+    )
     solution = mr.solve(room, elements=1000, rays=200_000)
     leaves = np.array(solution.elements.child) == 0
     patch, open_area = (np.array(x)[leaves] for x in (solution.elements.patch, solution.elements.open_area))
@@ -112,15 +119,18 @@ def test_kernels_do_not_grow_with_the_work(cornell):
     assert len(compiled(elements=12_000, rays=500_000, seed=1) - usual) < 0.15 * len(usual)
 
 
-@pytest.mark.parametrize("options, says", [
-    (dict(elements=10), "patches"),
-    (dict(elements=0), "--elements"),
-    (dict(rays=-5), "--rays"),
-    (dict(lines=0), "--lines"),
-    (dict(epsilon=0.0), "--epsilon"),
-    (dict(elements=100, epsilon=1.0), "not both"),
-    (dict(oracle="gmi"), "instance"),
-])
+@pytest.mark.parametrize(
+    "options, says",
+    [
+        (dict(elements=10), "patches"),
+        (dict(elements=0), "--elements"),
+        (dict(rays=-5), "--rays"),
+        (dict(lines=0), "--lines"),
+        (dict(epsilon=0.0), "--epsilon"),
+        (dict(elements=100, epsilon=1.0), "not both"),
+        (dict(oracle="gmi"), "instance"),
+    ],
+)
 def test_refused_options(cornell, options, says):
     with pytest.raises(mr.RadiosityError, match=says):
         mr.solve(cornell, **options)

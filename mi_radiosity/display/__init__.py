@@ -1,4 +1,5 @@
 """Radiosity shown: a continuous field over the mesh, and the `radiosity` integrator."""
+
 from .field import Field
 from .image import write_image
 from .integrator import SHADINGS, register, render

@@ -1,13 +1,14 @@
 """Irradiance as a continuous field over each flat or smooth surface (Gouraud)."""
+
 import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..solver.arrays import ColorSums, concat, lower_bound, opaque_index, totals, unique
-from ..solver.elements import NODES, child_at
+from ..core.arrays import ColorSums, concat, lower_bound, opaque_index, totals, unique
+from ..mesh.elements import NODES, child_at
 
-FAINT = 1e-4            # weight below which a node has no say
-SHARPEN = 1             # rounds in which vertices make up for what averaging took from the elements
+FAINT = 1e-4  # weight below which a node has no say
+SHARPEN = 1  # rounds in which vertices make up for what averaging took from the elements
 
 
 class Field:
@@ -57,9 +58,18 @@ class Field:
         quarter = child_at(a, b)
         # Nodes and local coordinates of the quarter that holds the point.
         middle = quarter == 3
-        a = dr.select(middle, 1 - 2 * a, 2 * a - dr.select(quarter == 1, 1., 0.))
-        b = dr.select(middle, 1 - 2 * b, 2 * b - dr.select(quarter == 2, 1., 0.))
-        def pick(*nodes): return dr.select(quarter == 0, mi.UInt32(nodes[0]), dr.select(quarter == 1, mi.UInt32(nodes[1]), dr.select(quarter == 2, mi.UInt32(nodes[2]), mi.UInt32(nodes[3]))))
+        a = dr.select(middle, 1 - 2 * a, 2 * a - dr.select(quarter == 1, 1.0, 0.0))
+        b = dr.select(middle, 1 - 2 * b, 2 * b - dr.select(quarter == 2, 1.0, 0.0))
+
+        def pick(*nodes):
+            return dr.select(
+                quarter == 0,
+                mi.UInt32(nodes[0]),
+                dr.select(
+                    quarter == 1, mi.UInt32(nodes[1]), dr.select(quarter == 2, mi.UInt32(nodes[2]), mi.UInt32(nodes[3]))
+                ),
+            )
+
         walled = active & dr.gather(mi.Bool, self.walled, leaf, active)
         x = e.model.above(dr.gather(mi.UInt32, e.patch, leaf, active), u, v)
         total, seen, weights = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
@@ -86,11 +96,11 @@ class _Topology:
         vertex, self.count = _weld(elements.model)
         self.corner = [dr.full(mi.UInt32, NONE, n) for _ in range(3)]
         self.middle = [dr.full(mi.UInt32, NONE, n) for _ in range(3)]
-        self.halved = []        # per level: vertices in the middle of straight sides, and the ends of those
+        self.halved = []  # per level: vertices in the middle of straight sides, and the ends of those
         level = dr.arange(mi.UInt32, roots)
         for corner, ids in zip(self.corner, vertex):
             dr.scatter(corner, ids, level)
-        straight = mi.UInt64(0xFFFFFFFFFFFFFFFF)        # sides that must not bend, as sorted keys
+        straight = mi.UInt64(0xFFFFFFFFFFFFFFFF)  # sides that must not bend, as sorted keys
         while dr.width(level):
             level, straight = self._next_level(level, straight)
         self._place_vertices()
@@ -144,8 +154,11 @@ class _Topology:
         self.count += dr.width(table)
 
         # ---- Corners of the children ----
-        child, c, m = (dr.gather(mi.UInt32, child, parents), [dr.gather(mi.UInt32, x, parents) for x in corner],
-                       [dr.gather(mi.UInt32, x, parents) for x in middle])
+        child, c, m = (
+            dr.gather(mi.UInt32, child, parents),
+            [dr.gather(mi.UInt32, x, parents) for x in corner],
+            [dr.gather(mi.UInt32, x, parents) for x in middle],
+        )
         for k, vertices in enumerate(((c[0], m[2], m[1]), (m[2], c[1], m[0]), (m[1], m[0], c[2]), (m[0], m[1], m[2]))):
             for corner, ids in zip(self.corner, vertices):
                 dr.scatter(corner, ids, child + k)
@@ -167,7 +180,10 @@ class _Topology:
         size, seen = dr.sqrt(area), dr.gather(mi.Float, e.open_area, self.leaves) / area
         across = dr.gather(mi.UInt32, e.across, self.leaves)
         bound = [2 * t for t in totals([mi.Float64(dr.abs(h)) / mi.Float64(size) * 16 for h in H])]
-        sums, weights = ColorSums(self.count, bound), ColorSums(self.count, 3 * [20 * totals([1 / mi.Float64(size)])[0]])
+        sums, weights = (
+            ColorSums(self.count, bound),
+            ColorSums(self.count, 3 * [20 * totals([1 / mi.Float64(size)])[0]]),
+        )
         for k, (a, b) in enumerate(sides):
             weight = dr.atan2(dr.norm(dr.cross(a, b)), dr.dot(a, b)) / size * seen
             for node, vertex, w in ((k, self.corner[k], weight), (k + 3, self.middle[k], dr.pi / size * seen)):
@@ -191,12 +207,15 @@ class _Topology:
         """The value in the middle of straight sides: the mean of the ends, or that of the one a wall leaves in sight (Color3f [n])."""
         a, b = (dr.gather(mi.Color3f, values, end) for end in (low, high))
         start, end = (dr.gather(mi.Point3f, self._point, k) for k in (low, high))
-        no_a, no_b = (self.elements.model.blocked(.5 * (start + end), x, active) for x in (start, end))
-        return dr.select(no_a & ~no_b, b, dr.select(no_b & ~no_a, a, .5 * (a + b)))
+        no_a, no_b = (self.elements.model.blocked(0.5 * (start + end), x, active) for x in (start, end))
+        return dr.select(no_a & ~no_b, b, dr.select(no_b & ~no_a, a, 0.5 * (a + b)))
 
     def node_points(self):
         """Where the nodes of leaves are (six Point3f [leaves])."""
-        def halfway(low, high, active): return .5 * (dr.gather(mi.Point3f, self._point, low) + dr.gather(mi.Point3f, self._point, high))
+
+        def halfway(low, high, active):
+            return 0.5 * (dr.gather(mi.Point3f, self._point, low) + dr.gather(mi.Point3f, self._point, high))
+
         nodes = self._nodes(self._point, halfway)
         dr.eval(nodes)
         return nodes
@@ -219,7 +238,13 @@ class _Topology:
         for k in range(3):
             index = dr.gather(mi.UInt32, self.middle[k], self.leaves)
             bent = index != NONE
-            nodes.append(dr.select(bent, dr.gather(type(table), table, index, bent), straight(corner[(k + 1) % 3], corner[(k + 2) % 3], ~bent)))
+            nodes.append(
+                dr.select(
+                    bent,
+                    dr.gather(type(table), table, index, bent),
+                    straight(corner[(k + 1) % 3], corner[(k + 2) % 3], ~bent),
+                )
+            )
         return nodes
 
     def mean(self, values):

@@ -1,11 +1,12 @@
 """Pictures on disk."""
+
 import json
 
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RadiosityError
-from ..files import writing
+from ..core.errors import RadiosityError
+from ..core.files import writing
 
 
 def write_image(path, image, stats=None):

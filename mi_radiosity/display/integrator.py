@@ -1,16 +1,17 @@
 """The `radiosity` integrator: any sensor looks at a solution through Mitsuba's own film."""
+
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import RadiosityError
+from ..core.errors import RadiosityError
 from ..oracles import make_oracle
 from ..scene.model import NONE
 from ..solver import solve
 from .field import Field
 
 SHADINGS = ("gouraud", "flat", "mesh")
-LINE_WIDTH = 1.0        # pixels
-LINE_SHADE = 0.25       # of the picture under an element outline
+LINE_WIDTH = 1.0  # pixels
+LINE_SHADE = 0.25  # of the picture under an element outline
 
 
 def _checked_shading(name):
@@ -21,6 +22,7 @@ def _checked_shading(name):
 
 def _integrator_class():
     """The class for the active variant: Mitsuba's base class is another one in each."""
+
     class RadiosityIntegrator(mi.SamplingIntegrator):
         """
         Displays a radiosity solution: L = (E + ρ H) / π, with ρ looked up at the pixel.
@@ -40,7 +42,7 @@ def _integrator_class():
                 if name in props:
                     self.options[name] = kind(props.get(name))
             self.progress = None
-            self.pixel = 1.0        # width of a pixel in units of the ray differentials
+            self.pixel = 1.0  # width of a pixel in units of the ray differentials
             self.show(None)
 
         def show(self, solution):
@@ -57,7 +59,7 @@ def _integrator_class():
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             # Mitsuba shrinks ray differentials to the spacing of samples.
-            self.pixel = (spp or chosen.sampler().sample_count()) ** .5
+            self.pixel = (spp or chosen.sampler().sample_count()) ** 0.5
             return super().render(scene, chosen, seed, spp, develop, evaluate)
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -75,7 +77,9 @@ def _integrator_class():
             if model.textured and model.overlaps:
                 # The face shown need not be the one the ray met.
                 patch = dr.select(lit, hit.patch, 0)
-                reflectance = model.faces.reflectance_at(dr.gather(mi.UInt32, model.face, patch), hit.u, hit.v, dr.gather(mi.Bool, model.back, patch))
+                reflectance = model.faces.reflectance_at(
+                    dr.gather(mi.UInt32, model.face, patch), hit.u, hit.v, dr.gather(mi.Bool, model.back, patch)
+                )
             elif model.textured:
                 si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, lit)
                 reflectance = si.bsdf().eval_diffuse_reflectance(si, lit)
@@ -106,7 +110,7 @@ def _integrator_class():
             here = local(ray.o, ray.d)
             dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
             per_pixel = dr.sqrt(dx * dx + dy * dy) * dr.opaque(mi.Float, self.pixel)
-            return active & dr.any(here < .5 * LINE_WIDTH * per_pixel)
+            return active & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
 
         def traverse(self, callback):
             pass

@@ -1,4 +1,5 @@
 """Refinement oracles compared: the same scene, elements, rays and views, error beside cost."""
+
 import functools
 import json
 import statistics
@@ -9,15 +10,15 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RadiosityError
-from ..files import writing
+from ..core.errors import RadiosityError
+from ..core.files import writing
 from ..oracles import make_oracle
 from ..scene import Model
 from ..solver import solve
 from .metrics import compare
 from .reference import Reference, identity, render_reference, versions
 
-PAPER = "ks,gmi:1.5,gmi:1.25,mi,gmi:0.75,gmi:0.5"        # the rows of table 1
+PAPER = "ks,gmi:1.5,gmi:1.25,mi,gmi:0.75,gmi:0.5"  # the rows of table 1
 QUESTIONS = {
     "mesh": "as many elements and as many power rays (the paper's question)",
     "rays": "as many rays in all: power, oracle and pilot rays together",
@@ -35,6 +36,7 @@ class Cell:
     ``question``: "mesh" for the budgets as given; "noise" for MORE_RAYS times the rays on the same mesh;
     "rays" or "time" to spend ``budget`` (rays in all, or seconds) by growing elements and rays together.
     """
+
     scene: str
     variant: str
     definitions: tuple
@@ -64,7 +66,7 @@ def parse_oracle(text):
         raise RadiosityError(f"--oracles {text}: write gmi with its index as gmi:0.5") from None
 
 
-_warm = set()           # what this process has compiled
+_warm = set()  # what this process has compiled
 
 
 @functools.lru_cache(maxsize=2)
@@ -83,6 +85,7 @@ def _halves(path, changed):
 def run_cell(cell):
     """Solve one Cell and measure it: (rows, pictures); runs in any process that sees the files."""
     from ..display import render
+
     stamp = Path(cell.scene).stat().st_mtime_ns
     _, model = _scene(cell.scene, cell.variant, cell.definitions, stamp)
     oracle = make_oracle(*parse_oracle(cell.oracle))
@@ -92,28 +95,53 @@ def run_cell(cell):
     for view, reference in zip(cell.views, cell.references):
         image = np.array(render(solution, view, spp=cell.spp))[..., :3]
         errors = compare(image, _halves(reference, Path(reference).stat().st_mtime_ns))
-        rows.append({"question": cell.question, "view": view, "oracle": oracle.name, "alpha": oracle.alpha, "seed": cell.seed,
-                     "elements": stats["elements"], "pairs": stats["pairs"], "rays": stats["rays"], "oracle_rays": stats["oracle_rays"],
-                     "pilot_rays": stats["pilot_rays"], "seconds": stats["seconds"]["total"], **errors.asdict(), "key": cell.key, "label": cell.oracle})
+        rows.append(
+            {
+                "question": cell.question,
+                "view": view,
+                "oracle": oracle.name,
+                "alpha": oracle.alpha,
+                "seed": cell.seed,
+                "elements": stats["elements"],
+                "pairs": stats["pairs"],
+                "rays": stats["rays"],
+                "oracle_rays": stats["oracle_rays"],
+                "pilot_rays": stats["pilot_rays"],
+                "seconds": stats["seconds"]["total"],
+                **errors.asdict(),
+                "key": cell.key,
+                "label": cell.oracle,
+            }
+        )
         if cell.pictures:
             pictures[f"{cell.oracle}_view{view}"] = image.astype(np.float32)
-            pictures[f"{cell.oracle}_view{view}_mesh"] = np.array(render(solution, view, spp=16, shading="mesh"))[..., :3].astype(np.float32)
+            pictures[f"{cell.oracle}_view{view}_mesh"] = np.array(render(solution, view, spp=16, shading="mesh"))[
+                ..., :3
+            ].astype(np.float32)
     return rows, pictures
 
 
 def _spend(cell, model, oracle):
     """Solve with the budget of the cell's question."""
-    def run(elements, rays):
-        return solve(model, oracle, elements=max(model.count, int(elements)), rays=max(1, int(rays)), lines=cell.lines, seed=cell.seed)
 
-    if (cell.oracle, cell.scene) not in _warm:           # compile first, so that seconds are warm
+    def run(elements, rays):
+        return solve(
+            model,
+            oracle,
+            elements=max(model.count, int(elements)),
+            rays=max(1, int(rays)),
+            lines=cell.lines,
+            seed=cell.seed,
+        )
+
+    if (cell.oracle, cell.scene) not in _warm:  # compile first, so that seconds are warm
         run(cell.elements, cell.rays // 10)
         _warm.add((cell.oracle, cell.scene))
     solution = run(cell.elements, cell.rays * (MORE_RAYS if cell.question == "noise" else 1))
     if cell.question in ("mesh", "noise"):
         return solution
     elements, rays = cell.elements, cell.rays
-    for _ in range(2):                                   # costs are not quite proportional
+    for _ in range(2):  # costs are not quite proportional
         factor = cell.budget / cost(solution.stats, cell.question)
         elements, rays = elements * factor, rays * factor
         solution = run(elements, rays)
@@ -134,6 +162,7 @@ def cost(stats, question):
 
 
 # ---- Running ---------------------------------------------------------------------------------------
+
 
 class InProcess(Executor):
     """An Executor that works where it stands."""
@@ -190,30 +219,76 @@ def run_cells(cells, executor, finished, progress=lambda done, total: None, work
 
 # ---- A whole comparison ----------------------------------------------------------------------------
 
-def compare_oracles(path, output, *, variant="llvm_ad_rgb", definitions=(), oracles=PAPER, elements=19_000, rays=2_684_000, lines=10, seeds=5,
-                    views=(0,), spp=64, reference_spp=1024, questions=tuple(QUESTIONS), scheduler=None, progress=lambda stage, done, total: None):
+
+def compare_oracles(
+    path,
+    output,
+    *,
+    variant="llvm_ad_rgb",
+    definitions=(),
+    oracles=PAPER,
+    elements=19_000,
+    rays=2_684_000,
+    lines=10,
+    seeds=5,
+    views=(0,),
+    spp=64,
+    reference_spp=1024,
+    questions=tuple(QUESTIONS),
+    scheduler=None,
+    progress=lambda stage, done, total: None,
+):
     """Compare oracles on a scene and write table.md, results.json, figures and report.html into ``output``.
 
     Rows that results.json already holds for the same scene and budgets are not computed again.
     Returns the results (dict). Raises RadiosityError for what the user can mend.
     """
     from .report import write_report
+
     path, output = Path(path).resolve(), Path(output)
     labels = [text.strip() for text in oracles.split(",")]
     for label in labels:
         make_oracle(*parse_oracle(label))
     scene, model = _scene(str(path), variant, tuple(definitions), path.stat().st_mtime_ns)
     references = {view: cached_reference(model, scene, view, output, reference_spp, progress) for view in views}
-    setting = {"fingerprint": model.fingerprint, "elements": elements, "rays": rays, "lines": lines, "spp": spp, "views": list(views),
-               "references": {str(v): identity(model, scene.sensors()[v]) | {"spp": sum(r.spp)} for v, (r, _) in references.items()}}
+    setting = {
+        "fingerprint": model.fingerprint,
+        "elements": elements,
+        "rays": rays,
+        "lines": lines,
+        "spp": spp,
+        "views": list(views),
+        "references": {
+            str(v): identity(model, scene.sensors()[v]) | {"spp": sum(r.spp)} for v, (r, _) in references.items()
+        },
+    }
     results = _resume(output, setting, str(path.name))
-    results["reference"] = {str(view): {"file": file.name, "spp": sum(r.spp), "noise": r.noise()} for view, (r, file) in references.items()}
+    results["reference"] = {
+        str(view): {"file": file.name, "spp": sum(r.spp), "noise": r.noise()} for view, (r, file) in references.items()
+    }
     executor = executor_for(scheduler)
 
     def cells(question, budget=0.0):
-        return [Cell(str(path), variant, tuple(definitions), label, seed, elements, rays, lines, spp, tuple(views),
-                     tuple(str(references[v][1].resolve()) for v in views), question, budget, pictures=question == "mesh" and seed == 0)
-                for seed in range(min(seeds, 2) if question == "noise" else seeds) for label in labels]
+        return [
+            Cell(
+                str(path),
+                variant,
+                tuple(definitions),
+                label,
+                seed,
+                elements,
+                rays,
+                lines,
+                spp,
+                tuple(views),
+                tuple(str(references[v][1].resolve()) for v in views),
+                question,
+                budget,
+                pictures=question == "mesh" and seed == 0,
+            )
+            for seed in range(min(seeds, 2) if question == "noise" else seeds)
+            for label in labels
+        ]
 
     def finished(cell, result):
         rows, pictures = result
@@ -226,13 +301,17 @@ def compare_oracles(path, output, *, variant="llvm_ad_rgb", definitions=(), orac
     for question in questions:
         budget = 0.0 if question in ("mesh", "noise") else _common_budget(results["rows"], labels, question)
         todo = [c for c in cells(question, budget) if c.key not in {r["key"] for r in results["rows"]}]
-        missing |= run_cells(todo, executor, finished, lambda done, total, q=question: progress(f"compare: same {q}", done, total))
+        missing |= run_cells(
+            todo, executor, finished, lambda done, total, q=question: progress(f"compare: same {q}", done, total)
+        )
     results["missing"] = {cell.key: str(error) for cell, error in missing.items()}
     _save_results(output, results)
     write_report(output, results, labels, {view: r for view, (r, _) in references.items()})
     if missing:
-        raise RadiosityError(f"{len(missing)} cells failed twice ({next(iter(missing)).key}: {next(iter(missing.values()))}); "
-                             "the others are kept: run the same command again to try once more")
+        raise RadiosityError(
+            f"{len(missing)} cells failed twice ({next(iter(missing)).key}: {next(iter(missing.values()))}); "
+            "the others are kept: run the same command again to try once more"
+        )
     return results
 
 
@@ -246,13 +325,18 @@ def cached_reference(model, scene, view, output, spp, progress):
     except OSError as error:
         raise RadiosityError(f"cannot write into {output} ({error.strerror}): choose another folder") from None
     file = folder / f"view{view}_{mark['scene'][:12]}_{mark['sensor'][:12]}.exr"
-    return render_reference(model, sensor, file, spp, progress=lambda done, total: progress(f"reference of view {view}", done, total)), file
+    return render_reference(
+        model, sensor, file, spp, progress=lambda done, total: progress(f"reference of view {view}", done, total)
+    ), file
 
 
 def _common_budget(rows, labels, question):
     """What the costliest oracle of the first question spent on average: the budget of everyone in the second."""
-    spent = [statistics.mean(cost(r, question) for r in rows if r["label"] == label and r["question"] == "mesh") for label in labels
-             if any(r["label"] == label and r["question"] == "mesh" for r in rows)]
+    spent = [
+        statistics.mean(cost(r, question) for r in rows if r["label"] == label and r["question"] == "mesh")
+        for label in labels
+        if any(r["label"] == label and r["question"] == "mesh" for r in rows)
+    ]
     return max(spent, default=0.0)
 
 
@@ -278,5 +362,6 @@ def _save_results(output, results):
 
 def _save_picture(path, image):
     from ..display import write_image
+
     path.parent.mkdir(exist_ok=True)
     write_image(path, mi.TensorXf(image))

@@ -1,10 +1,11 @@
 """How far an image is from a reference that is noisy itself."""
+
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
-PERCEPTUAL = (0.2126, 0.7152, 0.0722)       # Rec. 709 luminance, as in sRGB
-LAGS = 3                                    # pixels over which a reconstruction filter correlates noise
+PERCEPTUAL = (0.2126, 0.7152, 0.0722)  # Rec. 709 luminance, as in sRGB
+LAGS = 3  # pixels over which a reconstruction filter correlates noise
 
 
 def srgb(image):
@@ -15,7 +16,7 @@ def srgb(image):
 
 def mean_square(difference, weights=(1 / 3, 1 / 3, 1 / 3)):
     """Mean over pixels of the weighted squares of [height, width, 3] differences."""
-    return float((difference ** 2 @ np.asarray(weights)).mean())
+    return float((difference**2 @ np.asarray(weights)).mean())
 
 
 def rmse(a, b, weights=(1 / 3, 1 / 3, 1 / 3)):
@@ -31,13 +32,14 @@ def psnr(error):
 def relative_error(image, reference):
     """relMSE, linear, for HDR: mean of (x − r)² / (r² + 0.01)."""
     x, r = np.asarray(image, dtype=np.float64), np.asarray(reference, dtype=np.float64)
-    return float(((x - r) ** 2 / (r ** 2 + 0.01)).mean())
+    return float(((x - r) ** 2 / (r**2 + 0.01)).mean())
 
 
 @dataclass(frozen=True)
 class Errors:
     """Errors of an image. _a weighs channels equally, _p by luminance; ``clean`` is RMSE_a with the
     reference's noise removed, ± ``clean_error`` (one standard error of what that noise decides)."""
+
     rmse_a: float
     rmse_p: float
     psnr_a: float
@@ -64,17 +66,29 @@ def compare(image, halves):
     error_a, error_p = rmse(image, reference), rmse(image, reference, PERCEPTUAL)
     clean = float(max(((x - r0) * (x - r1)).mean(), 0.0) ** 0.5)
     q = ((x - (r0 + r1) / 2) * (r0 - r1)).mean(axis=2)
-    variance = max(_sum_of_neighbours(q), float((q ** 2).sum())) / q.size ** 2
-    return Errors(error_a, error_p, psnr(error_a), psnr(error_p), relative_error(image, reference),
-                  clean, variance ** 0.5 / (2 * max(clean, 1e-9)))
+    variance = max(_sum_of_neighbours(q), float((q**2).sum())) / q.size**2
+    return Errors(
+        error_a,
+        error_p,
+        psnr(error_a),
+        psnr(error_p),
+        relative_error(image, reference),
+        clean,
+        variance**0.5 / (2 * max(clean, 1e-9)),
+    )
 
 
 def _sum_of_neighbours(q):
     """Σ q(p) q(p + lag) over pixels p and all lags within LAGS."""
     padded = np.pad(q, LAGS)
     height, width = q.shape
-    return float(sum((q * padded[LAGS + dy:LAGS + dy + height, LAGS + dx:LAGS + dx + width]).sum()
-                     for dy in range(-LAGS, LAGS + 1) for dx in range(-LAGS, LAGS + 1)))
+    return float(
+        sum(
+            (q * padded[LAGS + dy : LAGS + dy + height, LAGS + dx : LAGS + dx + width]).sum()
+            for dy in range(-LAGS, LAGS + 1)
+            for dx in range(-LAGS, LAGS + 1)
+        )
+    )
 
 
 def reference_noise(halves):

@@ -1,4 +1,5 @@
 """Path-traced references: in passes, in two independent halves, in one file that can be added to."""
+
 import hashlib
 import json
 import math
@@ -10,13 +11,13 @@ import numpy as np
 import OpenEXR
 
 from .. import __version__
-from ..errors import RadiosityError
-from ..files import writing
+from ..core.errors import RadiosityError
+from ..core.files import writing
 from ..scene import Model
 from .metrics import reference_noise
 
-PASS = 64                   # samples per pixel of one pass: 8 × 8 strata
-WAVEFRONT = 1 << 24         # rays in flight, at most
+PASS = 64  # samples per pixel of one pass: 8 × 8 strata
+WAVEFRONT = 1 << 24  # rays in flight, at most
 
 
 @dataclass
@@ -25,6 +26,7 @@ class Reference:
 
     sums: float64 [2, height, width, 3]; spp: samples per pixel in each half.
     """
+
     identity: dict
     sums: np.ndarray
     spp: list = field(default_factory=lambda: [0, 0])
@@ -42,13 +44,22 @@ class Reference:
 
     def save(self, path):
         """One EXR: the mean as RGB, the halves beside it, the rest in its header."""
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage,
-                  "mi_radiosity": json.dumps(self.identity | {"spp": self.spp, "noise": self.noise()})}
+        header = {
+            "compression": OpenEXR.ZIP_COMPRESSION,
+            "type": OpenEXR.scanlineimage,
+            "mi_radiosity": json.dumps(self.identity | {"spp": self.spp, "noise": self.noise()}),
+        }
         halves = self.halves()
         with writing(path) as temporary:
             try:
-                OpenEXR.File(header, {"RGB": np.ascontiguousarray(halves.mean(axis=0)), "half0": np.ascontiguousarray(halves[0]),
-                                      "half1": np.ascontiguousarray(halves[1])}).write(temporary)
+                OpenEXR.File(
+                    header,
+                    {
+                        "RGB": np.ascontiguousarray(halves.mean(axis=0)),
+                        "half0": np.ascontiguousarray(halves[0]),
+                        "half1": np.ascontiguousarray(halves[1]),
+                    },
+                ).write(temporary)
             except RuntimeError as error:
                 raise OSError(str(error)) from None
 
@@ -60,19 +71,38 @@ class Reference:
                 data = json.loads(file.header()["mi_radiosity"])
                 spp = data.pop("spp")
                 data.pop("noise")
-                halves = np.stack([np.array(file.channels()[name].pixels, dtype=np.float64) for name in ("half0", "half1")])
+                halves = np.stack(
+                    [np.array(file.channels()[name].pixels, dtype=np.float64) for name in ("half0", "half1")]
+                )
             return Reference(data, halves * np.array(spp)[:, None, None, None], spp)
         except Exception as error:
-            raise RadiosityError(f"{path} is not a readable reference ({type(error).__name__}): remove it to render it anew") from None
+            raise RadiosityError(
+                f"{path} is not a readable reference ({type(error).__name__}): remove it to render it anew"
+            ) from None
 
 
 def identity(model, sensor, seed=0, depth=-1):
     """What a reference depends on: scene content, sensor, depth, seed, versions (dict)."""
     film = sensor.film()
-    view = hashlib.sha256(repr((sensor.class_name(), np.round(np.array(sensor.world_transform().matrix), 5).tolist(), str(film),
-                                [str(v) for _, v in mi.traverse(sensor)])).encode()).hexdigest()
-    return {"scene": model.fingerprint, "sensor": view, "depth": depth, "seed": seed, "sampler": "stratified",
-            "mitsuba": mi.__version__, "drjit": dr.__version__}
+    view = hashlib.sha256(
+        repr(
+            (
+                sensor.class_name(),
+                np.round(np.array(sensor.world_transform().matrix), 5).tolist(),
+                str(film),
+                [str(v) for _, v in mi.traverse(sensor)],
+            )
+        ).encode()
+    ).hexdigest()
+    return {
+        "scene": model.fingerprint,
+        "sensor": view,
+        "depth": depth,
+        "seed": seed,
+        "sampler": "stratified",
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+    }
 
 
 def render_reference(scene, sensor, path, spp=1024, seed=0, progress=lambda done, total: None):
@@ -94,13 +124,15 @@ def render_reference(scene, sensor, path, spp=1024, seed=0, progress=lambda done
     while sum(reference.spp) < spp or reference.spp[0] != reference.spp[1]:
         half = int(reference.spp[1] < reference.spp[0])
         number = sum(reference.spp) // each
-        image = np.array(tracer.render(model.scene, sensor, seed=_seed(seed, number), spp=each), dtype=np.float64)[..., :3]
+        image = np.array(tracer.render(model.scene, sensor, seed=_seed(seed, number), spp=each), dtype=np.float64)[
+            ..., :3
+        ]
         reference.sums[half] += each * image
         reference.spp[half] += each
         progress(sum(reference.spp), spp)
         if reference.spp[0] == reference.spp[1]:
             kept = _kept(path, want)
-            if kept and sum(kept.spp) >= sum(reference.spp):        # another process is ahead: go on from there
+            if kept and sum(kept.spp) >= sum(reference.spp):  # another process is ahead: go on from there
                 reference = kept
             else:
                 reference.save(path)
@@ -114,7 +146,9 @@ def _kept(path, want):
     reference = Reference.load(path)
     changed = [name for name in want if reference.identity.get(name) != want[name]]
     if changed:
-        raise RadiosityError(f"{path} is the reference of another {' and '.join(changed)}: remove it or choose another name")
+        raise RadiosityError(
+            f"{path} is the reference of another {' and '.join(changed)}: remove it or choose another name"
+        )
     return reference
 
 
@@ -137,7 +171,9 @@ def path_image(scene, sensor, spp, seed=0):
     most = pass_size(sensor.film().crop_size()[0] * sensor.film().crop_size()[1])
     while done < spp:
         count = min(most, spp - done)
-        image = image + count * np.array(tracer.render(scene, sensor, seed=_seed(seed + 0xB5, done), spp=count))[..., :3]
+        image = (
+            image + count * np.array(tracer.render(scene, sensor, seed=_seed(seed + 0xB5, done), spp=count))[..., :3]
+        )
         done += count
     return (image / done).astype(np.float32)
 

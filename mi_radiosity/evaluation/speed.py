@@ -1,4 +1,5 @@
 """What a solve costs beside tracing its rays: `python -m mi_radiosity.evaluation.speed SCENE`."""
+
 import argparse
 import os
 import resource
@@ -52,7 +53,7 @@ def measure(path, elements, rays, runs=7):
     patches = solve(scene, elements=elements, rays=rays).stats["patches"]
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        for seed, factor in ((1, 1), (2, .5), (3, 2)):
+        for seed, factor in ((1, 1), (2, 0.5), (3, 2)):
             solve(scene, elements=max(patches, int(elements * factor)), rays=int(rays * factor), seed=seed)
         compiled = sum(not k["cache_hit"] for k in dr.kernel_history((dr.KernelType.JIT,)))
     dr.kernel_history_clear()
@@ -61,7 +62,7 @@ def measure(path, elements, rays, runs=7):
     model = _recording_model(scene)
     stats = solve(model, elements=elements, rays=rays).stats
     carried, left = [], stats["rays"]
-    for ray in reversed(model.power_rays):          # the pilots' rays came first
+    for ray in reversed(model.power_rays):  # the pilots' rays came first
         if left <= 0:
             break
         carried.append(ray)
@@ -72,9 +73,18 @@ def measure(path, elements, rays, runs=7):
         solves.append(_clock(lambda: solve(scene, elements=elements, rays=rays))[0])
         traces.append(_clock(lambda: _trace(model, carried))[0])
     ratio = statistics.median(s / t for s, t in zip(solves, traces))
-    return {"elements": stats["elements"], "pairs": stats["pairs"], "rays": stats["rays"], "oracle_rays": stats["oracle_rays"],
-            "cold_seconds": cold, "warm_seconds": statistics.median(solves), "tracing_seconds": statistics.median(traces),
-            "solve_over_tracing": ratio, "later_kernels": compiled, "peak_megabytes": memory}
+    return {
+        "elements": stats["elements"],
+        "pairs": stats["pairs"],
+        "rays": stats["rays"],
+        "oracle_rays": stats["oracle_rays"],
+        "cold_seconds": cold,
+        "warm_seconds": statistics.median(solves),
+        "tracing_seconds": statistics.median(traces),
+        "solve_over_tracing": ratio,
+        "later_kernels": compiled,
+        "peak_megabytes": memory,
+    }
 
 
 def _clock(work):
@@ -89,13 +99,19 @@ def _clock(work):
 def _cold_seconds(path, elements, rays):
     """Seconds of a first solve in a process of its own, with an empty kernel cache."""
     with tempfile.TemporaryDirectory() as cache:
-        run = subprocess.run([sys.executable, "-c", COLD, str(path), mi.variant(), str(elements), str(rays)],
-                             env=os.environ | {"DRJIT_CACHE_DIR": cache}, capture_output=True, text=True, check=True)
+        run = subprocess.run(
+            [sys.executable, "-c", COLD, str(path), mi.variant(), str(elements), str(rays)],
+            env=os.environ | {"DRJIT_CACHE_DIR": cache},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     return float(run.stdout)
 
 
 def _recording_model(scene):
     """A Model that keeps the rays it casts."""
+
     class Recorder(Model):
         def trace(self, origin, direction, active=True):
             self.power_rays.append(mi.Ray3f(origin, direction))

@@ -1,14 +1,18 @@
 """Oracles from generalised mutual information (Havrda-Charvát-Tsallis), and their common kernel."""
+
 import math
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..errors import RadiosityError
+from ..core.errors import RadiosityError
+from ..core.llvm import require_variant
 from .base import KernelSamples, Oracle
 
-NEAR_ONE = 2.0 ** -5        # |u − 1| below which φ_α is summed as a series
-TERMS = 9                   # of the series: the first left out is below 1e-14 of the sum
+NEAR_ONE = 2.0**-5  # |u − 1| below which φ_α is summed as a series
+TERMS = 9  # of the series: the first left out is below 1e-14 of the sum
 
 
 def _expm1_ratio(z):
@@ -55,6 +59,7 @@ def information_gap(F, alpha):
     """
     alpha = _checked(alpha)
     if not isinstance(F, KernelSamples):
+        require_variant()
         F = _samples(F)
     if F.pairs == 0:
         return mi.Float64()
@@ -67,7 +72,6 @@ def information_gap(F, alpha):
 
 def _samples(F):
     """KernelSamples from an array [pairs, lines], refusing what is no kernel value."""
-    import numpy as np
     array = np.atleast_2d(np.asarray(F, dtype=np.float64))
     if array.ndim != 2 or not array.shape[1]:
         raise RadiosityError(f"F has the shape {array.shape}: give kernel samples as [pairs, lines]")
@@ -86,16 +90,19 @@ def _checked(alpha):
     return alpha
 
 
+@dataclass(frozen=True)
 class GMI(Oracle):
     """σ_ij = A_i A_j A_T^(α−2) δ_α/(1−α)  (eq. 14): the loss of generalised mutual information.
 
     Eq. 16 read literally drops 1/(1−α) and so never refines for α ≥ 1; with the factors kept, σ is
     ≥ 0, has no unit, does not depend on the scale of the scene and passes smoothly through α = 1.
     """
+
+    alpha: float = 0.5
     name = "gmi"
 
-    def __init__(self, alpha=0.5):
-        self.alpha = _checked(alpha)
+    def __post_init__(self):
+        object.__setattr__(self, "alpha", _checked(self.alpha))
 
     def sigma(self, samples, pair):
         scale = dr.opaque(mi.Float64, pair.total_area ** (self.alpha - 2))
@@ -105,16 +112,16 @@ class GMI(Oracle):
         return f"{self.name}:{self.alpha:g}"
 
 
+@dataclass(frozen=True)
 class MI(GMI):
     """σ_ij = A_i A_j / A_T (mean(F ln F) − F_avg ln F_avg): Shannon's limit α → 1 of GMI.
 
     Source: Feixas, Rigau, Bekaert, Sbert, "Information-theoretic oracle based on kernel smoothness
     for hierarchical radiosity", Eurographics 2002.
     """
-    name = "mi"
 
-    def __init__(self):
-        super().__init__(1)
+    alpha: float = field(default=1.0, init=False)
+    name = "mi"
 
     def __str__(self):
         return self.name

@@ -1,4 +1,5 @@
 """Transported power."""
+
 from .base import Oracle
 
 
@@ -8,6 +9,7 @@ class Power(Oracle):
     Source: Hanrahan, Salzman, Aupperle, "A rapid hierarchical radiosity algorithm", SIGGRAPH 1991
     (their BF refinement).
     """
+
     name = "power"
 
     def sigma(self, samples, pair):

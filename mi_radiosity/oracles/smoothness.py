@@ -1,4 +1,5 @@
 """Kernel smoothness."""
+
 import drjit as dr
 
 from .base import Oracle
@@ -10,6 +11,7 @@ class KS(Oracle):
     F_max, F_min and F_avg are taken over the S lines of the pair; σ has no unit.
     Source: Gortler, Schröder, Cohen, Hanrahan, "Wavelet radiosity", SIGGRAPH 1993.
     """
+
     name = "ks"
 
     def sigma(self, samples, pair):

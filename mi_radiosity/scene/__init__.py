@@ -1,4 +1,5 @@
 """A Mitsuba scene seen as oriented patches, and rays between them."""
+
 from .model import Model
 from .support import Finding, inspect
 

@@ -1,14 +1,15 @@
 """Faces of a Mitsuba scene with their geometry and materials, as NumPy arrays."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RadiosityError
-from .sampling import triangle
+from ..core.errors import RadiosityError
+from ..core.points import triangle
 from .support import is_textured, label
 from .tessellate import disk_mesh
 
-FLATNESS = 1e-12            # area / longest edge² below which a face is degenerate
+FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 
 
 class Faces:
@@ -47,11 +48,13 @@ class Faces:
             faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
             corners.append(positions[faces])
             counts.append(len(faces))
-        self.shape = np.repeat(np.arange(len(counts)), counts)             # [faces]
-        corners = np.concatenate(corners)                                       # [faces, 3, 3]
+        self.shape = np.repeat(np.arange(len(counts)), counts)  # [faces]
+        corners = np.concatenate(corners)  # [faces, 3, 3]
         if not len(corners):
             raise RadiosityError("the scene has no faces: nothing can be lit")
-        self._refuse(~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh")
+        self._refuse(
+            ~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh"
+        )
 
         self.corners = corners
         self.centre = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
@@ -59,10 +62,12 @@ class Faces:
         e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         cross = np.cross(e1, e2)
         double_area = np.linalg.norm(cross, axis=1)
-        longest = np.maximum.reduce([(e ** 2).sum(axis=1) for e in (e1, e2, e2 - e1)])
+        longest = np.maximum.reduce([(e**2).sum(axis=1) for e in (e1, e2, e2 - e1)])
         self.degenerate = double_area <= FLATNESS * longest
         if self.degenerate.any():
-            self.warnings.append(f"{int(self.degenerate.sum())} faces without area are left out, in {self.names(self.degenerate)}")
+            self.warnings.append(
+                f"{int(self.degenerate.sum())} faces without area are left out, in {self.names(self.degenerate)}"
+            )
         self.e1, self.e2 = e1, e2
         self.area = double_area / 2
         self.normal = cross / np.where(self.degenerate, 1, double_area)[:, None]
@@ -99,7 +104,7 @@ class Faces:
         face, third = dr.arange(mi.UInt32, n), dr.full(mi.Float, 1 / 3, n)
         si = self.surface(face, third, third)
         shading = np.array(si.sh_frame.n, dtype=np.float64).reshape(3, n).T
-        self.flipped = (shading * self.normal).sum(axis=1) < 0      # against the order of the corners
+        self.flipped = (shading * self.normal).sum(axis=1) < 0  # against the order of the corners
         self.normal[self.flipped] *= -1
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
@@ -108,23 +113,34 @@ class Faces:
         points = 16 if self.textured else 1
         rho = np.zeros((2, n, 3))
         for k in range(points):
-            u, v = (third, third) if points == 1 else triangle(*(mi.Float(x) for x in ((k + .5) / points, (k * 7 % 16 + .5) / 16)))
+            u, v = (
+                (third, third)
+                if points == 1
+                else triangle(*(mi.Float(x) for x in ((k + 0.5) / points, (k * 7 % 16 + 0.5) / 16)))
+            )
             for side in range(2):
-                value = self.reflectance_at(face, u + dr.zeros(mi.Float, n), v + dr.zeros(mi.Float, n), dr.full(mi.Bool, side == 1, n))
+                value = self.reflectance_at(
+                    face, u + dr.zeros(mi.Float, n), v + dr.zeros(mi.Float, n), dr.full(mi.Bool, side == 1, n)
+                )
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         self._refuse(~np.isfinite(rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
-        self._refuse((rho >= 1).any(axis=(0, 2)), "has a reflectance of 1 or more, which conserves no energy: make it less than 1")
+        self._refuse(
+            (rho >= 1).any(axis=(0, 2)),
+            "has a reflectance of 1 or more, which conserves no energy: make it less than 1",
+        )
         self._refuse((rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
-        self.rho = rho                                                         # [2 sides, faces, 3]
+        self.rho = rho  # [2 sides, faces, 3]
 
         originals = dr.gather(mi.ShapePtr, self.scene.shapes_dr(), dr.arange(mi.UInt32, len(shapes)))
         si = dr.zeros(mi.SurfaceInteraction3f, len(shapes))
         si.wi = mi.Vector3f(0, 0, 1)
         radiance = np.array(mi.Color3f(originals.emitter().eval(si)), dtype=np.float64).reshape(3, -1).T
         lit = np.array([s.is_emitter() for s in shapes])
-        self.exitance = np.where(lit[:, None], np.pi * radiance, 0)[self.shape]       # [faces, 3]
-        self._refuse(~np.isfinite(self.exitance).all(axis=1) | (self.exitance < 0).any(axis=1),
-                     "emits a radiance that is negative or not a number: repair its emitter")
+        self.exitance = np.where(lit[:, None], np.pi * radiance, 0)[self.shape]  # [faces, 3]
+        self._refuse(
+            ~np.isfinite(self.exitance).all(axis=1) | (self.exitance < 0).any(axis=1),
+            "emits a radiance that is negative or not a number: repair its emitter",
+        )
         if not (self.exitance * self.area[:, None]).any():
             raise RadiosityError("the scene has no light: give at least one shape an 'area' emitter")
 
@@ -160,8 +176,8 @@ def _canonical_rank(corners):
     centroid = corners.mean(axis=1)
     low = centroid.min(axis=0)
     # Off the borders of cells, where halves and thirds lie: rounding must not decide there.
-    place = (centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (3 ** .5 - 1) + 1 - 3 ** .5 / 2
-    cell = (place * (2 ** 20 - 1)).astype(np.uint64)
+    place = (centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (3**0.5 - 1) + 1 - 3**0.5 / 2
+    cell = (place * (2**20 - 1)).astype(np.uint64)
     morton = np.zeros(len(corners), dtype=np.uint64)
     for bit in range(20):
         for axis in range(3):

@@ -1,4 +1,5 @@
 """The scene as the solver sees it: oriented patches and the rays between them."""
+
 import hashlib
 from dataclasses import dataclass
 
@@ -6,25 +7,27 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import _llvm
-from ..errors import RadiosityError
+from ..core import llvm as _llvm
+from ..core.errors import RadiosityError
 from .faces import Faces, owned
 from .overlap import Overlaps
-from .sampling import ROUNDS, cosine_direction, kronecker, triangle
+from ..core.points import ROUNDS, cosine_direction, kronecker, triangle
 from .support import require_supported
 
-NONE = 0xFFFFFFFF           # "no patch", "no element", "no pair"
-RAY_OFFSET = 2.0 ** -18     # of the largest coordinate: some 30 roundings of float32
-PROBES = 32                 # rays per side that look for light
-LAMP_PROBES = 1 << 16       # rays from all lamps together
+NONE = 0xFFFFFFFF  # "no patch", "no element", "no pair"
+RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
+PROBES = 32  # rays per side that look for light
+LAMP_PROBES = 1 << 16  # rays from all lamps together
 
 
 def require_variant():
     """Raise RadiosityError unless the active Mitsuba variant can run the solver."""
     variant = mi.variant() or "none"
     if not variant.startswith(("llvm_", "cuda_")) or "rgb" not in variant:
-        raise RadiosityError(f"the Mitsuba variant '{variant}' cannot be used: choose llvm_ad_rgb or cuda_ad_rgb "
-                             "with mi.set_variant(...) or -m")
+        raise RadiosityError(
+            f"the Mitsuba variant '{variant}' cannot be used: choose llvm_ad_rgb or cuda_ad_rgb "
+            "with mi.set_variant(...) or -m"
+        )
     if variant.startswith("llvm_") and (problem := _llvm.problem()):
         raise RadiosityError(problem)
 
@@ -32,9 +35,10 @@ def require_variant():
 @dataclass
 class Hit:
     """Where rays end. patch is NONE on the sides of faces that take no part in light transport."""
-    valid: "mi.Bool"        # [rays] something was hit
-    patch: "mi.UInt32"      # [rays]
-    u: "mi.Float"           # [rays] barycentric coordinates on the face
+
+    valid: "mi.Bool"  # [rays] something was hit
+    patch: "mi.UInt32"  # [rays]
+    u: "mi.Float"  # [rays] barycentric coordinates on the face
     v: "mi.Float"
 
 
@@ -69,9 +73,18 @@ class Model:
         """Faces in one another: one of them is lit and shown wherever several are."""
         f = self.faces
         sound, exitance = ~f.degenerate, f.exitance.sum(axis=1)
-        self._candidate = np.column_stack([sound, sound & f.two_sided])         # [faces, front and back]
-        self.overlaps = Overlaps(f.corners, f.normal, f.area, sound, f.rank, self._candidate, np.column_stack([exitance, 0 * exitance]),
-                                 f.rho.sum(axis=2).T, self.offset)
+        self._candidate = np.column_stack([sound, sound & f.two_sided])  # [faces, front and back]
+        self.overlaps = Overlaps(
+            f.corners,
+            f.normal,
+            f.area,
+            sound,
+            f.rank,
+            self._candidate,
+            np.column_stack([exitance, 0 * exitance]),
+            f.rho.sum(axis=2).T,
+            self.offset,
+        )
         self._candidate &= ~self.overlaps.covered
         if self.overlaps:
             self.overlaps.prepare(owned, self.centre)
@@ -83,13 +96,15 @@ class Model:
         doubled = self.overlaps.keep(2 * self._faces + self.sides % 2)
         self.overlaps.prepare(owned, self.centre)
         if len(doubled):
-            self.warnings.append(f"{len(doubled)} faces lie in others, in {self.faces.names(doubled)}: where they do, a lamp or else the smaller surface is taken to be on top")
+            self.warnings.append(
+                f"{len(doubled)} faces lie in others, in {self.faces.names(doubled)}: where they do, a lamp or else the smaller surface is taken to be on top"
+            )
 
     # ---- Patches -------------------------------------------------------------------------------
 
     def _choose_sides(self):
         """Make patches of the sides that light can reach: model only what a scene needs."""
-        sides = np.flatnonzero(self._candidate)         # front and back in turn
+        sides = np.flatnonzero(self._candidate)  # front and back in turn
         self.use_sides(np.sort(2 * self.faces.rank[sides // 2] + sides % 2))
         reached = self._reached()
         self.use_sides(self.sides[reached])
@@ -103,7 +118,10 @@ class Model:
         sign = np.where(back == 1, -1.0, 1.0)
         table = np.full(2 * len(self.faces.shape), NONE, dtype=np.uint32)
         table[2 * face + back] = np.arange(len(sides))
-        def vector(kind, a): return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
+
+        def vector(kind, a):
+            return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
+
         self.count, self._faces = len(sides), face
         self.face = owned(mi.UInt32, face)
         self.back = owned(mi.UInt32, back) == 1
@@ -128,6 +146,7 @@ class Model:
         """
         n = self.count
         emits = np.array(dr.max(self.emission) > 0).astype(bool)
+
         def cast(patch, index):
             u, v, s, t = kronecker(index, patch, dr.opaque(mi.UInt32, 0))
             hit = self.trace(*self.leave(patch, *triangle(u, v), s, t))
@@ -144,10 +163,17 @@ class Model:
             number = owned(mi.UInt32, np.tile(np.arange(each), len(lamps)))
             target = np.concatenate([target, cast(owned(mi.UInt32, more), number)])
             patch, line = index // PROBES, index % PROBES
-            lamp = dr.gather(mi.UInt32, owned(mi.UInt32, lamps), mi.sample_tea_32(index, 0, ROUNDS)[0] % dr.opaque(mi.UInt32, len(lamps)))
+            lamp = dr.gather(
+                mi.UInt32,
+                owned(mi.UInt32, lamps),
+                mi.sample_tea_32(index, 0, ROUNDS)[0] % dr.opaque(mi.UInt32, len(lamps)),
+            )
             x0, x1, y0, y1 = kronecker(line, patch, dr.opaque(mi.UInt32, 1))
             sees = np.array(self._connected(patch, *triangle(x0, x1), lamp, *triangle(y0, y1))).astype(bool)
-            source, target = np.concatenate([source, np.array(lamp)[sees]]), np.concatenate([target, np.array(patch)[sees]])
+            source, target = (
+                np.concatenate([source, np.array(lamp)[sees]]),
+                np.concatenate([target, np.array(patch)[sees]]),
+            )
         source, target = source[target != NONE], target[target != NONE]
         reached, before = emits, 0
         while reached.sum() > before:
@@ -169,8 +195,11 @@ class Model:
 
     def point(self, patch, u, v):
         """Points of patches relative to the scene's centre (Point3f [n])."""
-        return (dr.gather(mi.Point3f, self.p0, patch) + dr.gather(mi.Vector3f, self.e1, patch) * u
-                + dr.gather(mi.Vector3f, self.e2, patch) * v)
+        return (
+            dr.gather(mi.Point3f, self.p0, patch)
+            + dr.gather(mi.Vector3f, self.e1, patch) * u
+            + dr.gather(mi.Vector3f, self.e2, patch) * v
+        )
 
     def above(self, patch, u, v):
         """Points of patches, lifted off them by the rounding of rays (Point3f [n])."""
@@ -239,5 +268,7 @@ class Model:
     def _connected(self, i, ui, vi, j, uj, vj):
         """Do points of patches see each other, each more than rounding above the plane of the other (Bool [n])?"""
         d = self.point(j, uj, vj) - self.point(i, ui, vi)
-        above = (dr.dot(dr.gather(mi.Vector3f, self.normal, i), d) > self._lift) & (-dr.dot(dr.gather(mi.Vector3f, self.normal, j), d) > self._lift)
+        above = (dr.dot(dr.gather(mi.Vector3f, self.normal, i), d) > self._lift) & (
+            -dr.dot(dr.gather(mi.Vector3f, self.normal, j), d) > self._lift
+        )
         return above & (self.kernel(i, ui, vi, j, uj, vj) > 0)

@@ -1,11 +1,12 @@
 """Faces that lie in one another: which of them a ray meets is decided here, not by rounding."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-CHUNK = 1 << 21         # candidate pairs tested at a time: bounds memory
-EDGE = 1e-5             # how far outside of a face, in barycentric coordinates, a point still counts as on it
-LATTICE = 8             # points along a side that show whether a face is covered
+CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
+EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
+LATTICE = 8  # points along a side that show whether a face is covered
 
 
 class Overlaps:
@@ -34,7 +35,14 @@ class Overlaps:
         size = np.bincount(surface, weights=np.where(sound, area, 0))[surface]
         first = np.full(surface.max() + 1, len(area))
         np.minimum.at(first, surface, rank)
-        keys = (rank[:, None], first[surface][:, None], reflectance, np.round(np.log(size + 1e-300), 4)[:, None], -exitance, ~present)
+        keys = (
+            rank[:, None],
+            first[surface][:, None],
+            reflectance,
+            np.round(np.log(size + 1e-300), 4)[:, None],
+            -exitance,
+            ~present,
+        )
         order[np.lexsort([np.broadcast_to(k, present.shape).ravel() for k in keys])] = np.arange(present.size)
 
         # ---- For every side, the sides before it, best first ----
@@ -70,7 +78,10 @@ class Overlaps:
             f, g = f[near], g[near]
             axis = np.abs(normal[f]).argmax(axis=1)
             flat = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
-            meet = _triangles_meet(*(np.take_along_axis(self.corners[k], np.broadcast_to(flat, (len(k), 3, 2)), axis=2) for k in (f, g)), self.tolerance)
+            meet = _triangles_meet(
+                *(np.take_along_axis(self.corners[k], np.broadcast_to(flat, (len(k), 3, 2)), axis=2) for k in (f, g)),
+                self.tolerance,
+            )
             found.append(np.column_stack([f[meet], g[meet]]))
         pairs = np.concatenate(found)
         return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
@@ -101,8 +112,13 @@ class Overlaps:
     def prepare(self, owned, centre):
         """Tables for ``owner``, on the device."""
         corner = self.corners - centre
-        def vector(kind, a): return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
-        self._tables = [vector(mi.Point3f, corner[:, 0])] + [vector(mi.Vector3f, corner[:, k] - corner[:, 0]) for k in (1, 2)]
+
+        def vector(kind, a):
+            return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
+
+        self._tables = [vector(mi.Point3f, corner[:, 0])] + [
+            vector(mi.Vector3f, corner[:, k] - corner[:, 0]) for k in (1, 2)
+        ]
         self._starts = owned(mi.UInt32, np.searchsorted(self._side, np.arange(self.covered.size + 1)))
         self._others = owned(mi.UInt32, self._other)
 
@@ -136,13 +152,15 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
     for size in np.unique(level[faces]):
         # Faces no larger than a cell are in eight cells at most.
         small = faces[level[faces] <= size]
-        ends = np.floor(np.stack([low[small], high[small]]) / 2.0 ** size).astype(np.int64)
+        ends = np.floor(np.stack([low[small], high[small]]) / 2.0**size).astype(np.int64)
         wide = ends[0] != ends[1]
         keys, there = [], []
         for corner in np.ndindex(2, 2, 2):
             new = (wide | (np.array(corner) == 0)).all(axis=1)
             x, y, z = (ends[corner[k], new, k] for k in range(3))
-            keys.append(x * 0x9E3779B97F4A7C1 + y * 0x2545F4914F6CDD1D + z * 0x27D4EB2F165667C5)    # two cells of one key only cost time
+            keys.append(
+                x * 0x9E3779B97F4A7C1 + y * 0x2545F4914F6CDD1D + z * 0x27D4EB2F165667C5
+            )  # two cells of one key only cost time
             there.append(small[new])
         keys, there = np.concatenate(keys), np.concatenate(there)
         largest = np.flatnonzero(level[there] == size)
@@ -152,8 +170,10 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
         for part in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // CHUNK)) + 1):
             each = count[part]
             g = np.repeat(there[part], each)
-            f = there[largest[np.repeat(start[part], each) + np.arange(len(g)) - np.repeat(np.cumsum(each) - each, each)]]
-            near = ((f < g) | (level[g] < size)) & likely(f, g)      # first, as few pass
+            f = there[
+                largest[np.repeat(start[part], each) + np.arange(len(g)) - np.repeat(np.cumsum(each) - each, each)]
+            ]
+            near = ((f < g) | (level[g] < size)) & likely(f, g)  # first, as few pass
             f, g = f[near], g[near]
             shared = np.minimum(high[f], high[g]) - np.maximum(low[f], low[g]) - 2 * tolerance
             near = (shared > -tolerance).all(axis=1) & ((shared > tolerance / 2).sum(axis=1) > 1)
@@ -199,6 +219,6 @@ def _inside(points, triangles):
     """Do ``points`` [n, m, 3] lie in the triangles [n, 3, 3] of their planes (bool [n, m])?"""
     e1, e2 = (triangles[:, k, None] - triangles[:, :1] for k in (1, 2))
     x, normal = points - triangles[:, :1], np.cross(e1, e2)
-    n2 = (normal ** 2).sum(axis=2)
+    n2 = (normal**2).sum(axis=2)
     a, b = (np.cross(x, e2) * normal).sum(axis=2) / n2, (np.cross(e1, x) * normal).sum(axis=2) / n2
     return (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)

@@ -1,9 +1,10 @@
 """What of a Mitsuba scene is modelled, and what is not and why."""
+
 from dataclasses import dataclass
 
 import mitsuba as mi
 
-from ..errors import RadiosityError
+from ..core.errors import RadiosityError
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
@@ -13,12 +14,14 @@ CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum",
 @dataclass(frozen=True)
 class Finding:
     """One part of a scene that is not modelled."""
-    what: str       # "shape 'ball' (Sphere)"
-    why: str        # what is wrong and what to do
+
+    what: str  # "shape 'ball' (Sphere)"
+    why: str  # what is wrong and what to do
 
 
 def _nested(obj):
     """The Mitsuba objects that ``obj`` is made of, itself excluded."""
+
     class Collect(mi.TraversalCallback):
         found = ()
 
@@ -38,14 +41,14 @@ def _unsupported_bsdf(bsdf):
         return None
     if kind not in NESTING:
         return kind
-    return next((bad for part in _nested(bsdf) if isinstance(part, mi.BSDF)
-                 and (bad := _unsupported_bsdf(part))), None)
+    return next((bad for part in _nested(bsdf) if isinstance(part, mi.BSDF) and (bad := _unsupported_bsdf(part))), None)
 
 
 def is_textured(bsdf):
     """Does the reflectance of ``bsdf`` vary over a surface?"""
-    return any(is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT
-               for part in _nested(bsdf))
+    return any(
+        is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in _nested(bsdf)
+    )
 
 
 def label(shape, index):
@@ -64,14 +67,19 @@ def inspect(scene):
         if shape.interior_medium() is not None or shape.exterior_medium() is not None:
             findings.append(Finding(name, "participating media are not modelled: remove the medium"))
         if bad := _unsupported_bsdf(shape.bsdf()):
-            findings.append(Finding(name, f"its BSDF {bad} is not diffuse: use 'diffuse', 'twosided' "
-                                          "or a 'blendbsdf' of those"))
+            findings.append(
+                Finding(name, f"its BSDF {bad} is not diffuse: use 'diffuse', 'twosided' or a 'blendbsdf' of those")
+            )
         if shape.is_emitter() and mi.has_flag(shape.emitter().flags(), mi.EmitterFlags.SpatiallyVarying):
             findings.append(Finding(name, "its radiance is textured: use a constant radiance"))
     for index, emitter in enumerate(scene.emitters()):
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
-            findings.append(Finding(f"emitter '{emitter.id() or index}' ({emitter.class_name()})",
-                                    "only constant area emitters are modelled: use an 'area' emitter"))
+            findings.append(
+                Finding(
+                    f"emitter '{emitter.id() or index}' ({emitter.class_name()})",
+                    "only constant area emitters are modelled: use an 'area' emitter",
+                )
+            )
     return findings
 
 

@@ -1,4 +1,5 @@
 """Triangle meshes in the place of shapes that are not meshes."""
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -1,4 +1,5 @@
 """Hierarchical Monte Carlo radiosity: elements, pairs, refinement, power; solve() ─► Solution."""
+
 from .solution import Solution
 from .solve import solve
 

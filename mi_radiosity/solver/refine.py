@@ -1,19 +1,20 @@
 """Refinement: from patches to a mesh, worst pairs first."""
+
 import math
 
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import RadiosityError
+from ..core.errors import RadiosityError
 from ..scene.model import NONE
-from .arrays import concat
-from .power import RayRecord, distribute
+from ..core.arrays import concat
+from ..transport.series import RayRecord, distribute
 
-GROWTH = 0.1                # of the leaves may split in one wave,
-LEAST_SPLITS = 64           # or so many
-STEP = 1 / 4                # by which the level comes down, above which pairs split
-RENEW = 4                   # pilot rays are cast anew when the mesh has grown by this factor
-PILOT_RAYS = 24             # per leaf, at least
+GROWTH = 0.1  # of the leaves may split in one wave,
+LEAST_SPLITS = 64  # or so many
+STEP = 1 / 4  # by which the level comes down, above which pairs split
+RENEW = 4  # pilot rays are cast anew when the mesh has grown by this factor
+PILOT_RAYS = 24  # per leaf, at least
 LEAST_PILOT = 1 << 16
 MOST_PILOT = 1 << 20
 PILOT_TAIL = 0.1
@@ -55,8 +56,10 @@ class Refinement:
             if not self._until_pilot() and self._room():
                 self._pilot()
         if self.wanted is not None and self._room() and self.exact:
-            raise RadiosityError(f"the oracle '{self.oracle}' finds nothing left to refine at {self.elements.leaves} elements: "
-                                 f"ask for fewer than {self.wanted} --elements, or give --epsilon instead")
+            raise RadiosityError(
+                f"the oracle '{self.oracle}' finds nothing left to refine at {self.elements.leaves} elements: "
+                f"ask for fewer than {self.wanted} --elements, or give --epsilon instead"
+            )
 
     def _room(self):
         """How many more elements may split."""
@@ -75,7 +78,14 @@ class Refinement:
         record = []
         # Each pilot draws from a stream of its own, and none from the final one's.
         self.pilots += 1
-        flow = distribute(self.pairs, rays, (self.seed + 0x9E3779B9 * self.pilots) & 0xFFFFFFFF, first_share=self.first_share, tail=PILOT_TAIL, record=record)
+        flow = distribute(
+            self.pairs,
+            rays,
+            (self.seed + 0x9E3779B9 * self.pilots) & 0xFFFFFFFF,
+            first_share=self.first_share,
+            tail=PILOT_TAIL,
+            record=record,
+        )
         self.rays += flow.rays
         self.first_share = flow.first_share
         self.hits = _concat_hits(record)
@@ -114,9 +124,11 @@ class Refinement:
         if dr.width(open_pairs) == 0:
             return open_pairs, mi.Float(), mi.UInt32()
         value = dr.gather(mi.Float, p.sigma, open_pairs)
-        if self.oracle.weighted:
+        if self.oracle.name != "uniform":
             reflectance = dr.gather(mi.Color3f, self.elements.reflectance, dr.gather(mi.UInt32, p.receiver, open_pairs))
-            value *= dr.max(reflectance * dr.gather(mi.Color3f, self.radiosity, dr.gather(mi.UInt32, p.source, open_pairs)))
+            value *= dr.max(
+                reflectance * dr.gather(mi.Color3f, self.radiosity, dr.gather(mi.UInt32, p.source, open_pairs))
+            )
         element = p.larger(open_pairs)
         value = dr.select(element == NONE, 0, value)
         dr.eval(value, element)
@@ -127,7 +139,14 @@ class Refinement:
         e = self.elements
         worst = dr.zeros(mi.UInt32, len(e))
         # Floats ≥ 0 sort like their bits, and a maximum does not depend on the order.
-        dr.scatter_reduce(dr.ReduceOp.Max, worst, dr.reinterpret_array(mi.UInt32, value), element, element != NONE, mode=dr.ReduceMode.Local)
+        dr.scatter_reduce(
+            dr.ReduceOp.Max,
+            worst,
+            dr.reinterpret_array(mi.UInt32, value),
+            element,
+            element != NONE,
+            mode=dr.ReduceMode.Local,
+        )
         worst = dr.reinterpret_array(mi.Float, worst)
         # The level only comes down, and only when all above it are split: one freak pair must not
         # decide how far the others get.
@@ -151,7 +170,11 @@ class Refinement:
 
     def _inherit(self, before):
         """New elements start with the radiosity of their parents."""
-        k = dr.gather(mi.UInt32, self.elements.parent, dr.arange(mi.UInt32, len(self.elements) - before) + dr.opaque(mi.UInt32, before))
+        k = dr.gather(
+            mi.UInt32,
+            self.elements.parent,
+            dr.arange(mi.UInt32, len(self.elements) - before) + dr.opaque(mi.UInt32, before),
+        )
         self.radiosity = concat(self.radiosity, dr.gather(mi.Color3f, self.radiosity, k))
         dr.eval(self.radiosity)
 
@@ -166,6 +189,16 @@ class Refinement:
 def _concat_hits(record):
     """One RayRecord of all rays that met a patch."""
     kept = [dr.compress(r.i != NONE) for r in record]
-    def join(kind, name): return concat(*(dr.gather(kind, getattr(r, name), k) for r, k in zip(record, kept)))
-    return RayRecord(join(mi.UInt32, "i"), join(mi.Float, "ui"), join(mi.Float, "vi"),
-                     join(mi.UInt32, "j"), join(mi.Float, "uj"), join(mi.Float, "vj"), join(mi.UInt32, "pair"))
+
+    def join(kind, name):
+        return concat(*(dr.gather(kind, getattr(r, name), k) for r, k in zip(record, kept)))
+
+    return RayRecord(
+        join(mi.UInt32, "i"),
+        join(mi.Float, "ui"),
+        join(mi.Float, "vi"),
+        join(mi.UInt32, "j"),
+        join(mi.Float, "uj"),
+        join(mi.Float, "vj"),
+        join(mi.UInt32, "pair"),
+    )

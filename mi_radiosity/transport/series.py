@@ -1,19 +1,20 @@
 """Distribution of power over the hierarchy: stochastic Jacobi radiosity with an exact ray budget."""
+
 from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import ROUNDS, hash_pair, kronecker, triangle
-from .arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
-from .cover import note_light
+from ..core.points import ROUNDS, hash_pair, kronecker, triangle
+from ..core.arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
+from ..mesh.exposure import note_light
 
-TAIL = 0.01             # share of the power below which the rest is summed in closed form
-ITERATIONS = 64         # after so many the rest is summed in closed form, too
-SEATS = 8               # points of a divided leaf that it sends light from
-AT_ONCE = 1 << 23       # rays cast in one launch: bounds memory, and the time until an interrupt is heard
-WEIGHTS = 2.0 ** 46     # resolution of the ray distribution over elements
+TAIL = 0.01  # share of the power below which the rest is summed in closed form
+ITERATIONS = 64  # after so many the rest is summed in closed form, too
+SEATS = 8  # points of a divided leaf that it sends light from
+AT_ONCE = 1 << 23  # rays cast in one launch: bounds memory, and the time until an interrupt is heard
+WEIGHTS = 2.0**46  # resolution of the ray distribution over elements
 
 
 @dataclass
@@ -23,27 +24,29 @@ class Flow:
     ``direct`` and ``indirect`` are Color3f [elements], right at the leaves and pulled to their
     ancestors.
     """
+
     direct: "mi.Color3f" = None
     indirect: "mi.Color3f" = None
     rays: int = 0
     iterations: int = 0
-    first_share: float = 1.0        # of the power shot in all, the lamps' part
+    first_share: float = 1.0  # of the power shot in all, the lamps' part
     emitted: list = field(default_factory=lambda: [0.0] * 3)
     escaped: list = field(default_factory=lambda: [0.0] * 3)
-    blocked: list = field(default_factory=lambda: [0.0] * 3)    # absorbed by sides that reflect nothing
+    blocked: list = field(default_factory=lambda: [0.0] * 3)  # absorbed by sides that reflect nothing
     unshot: list = field(default_factory=lambda: [0.0] * 3)
 
 
 @dataclass
 class RayRecord:
     """The rays of a pilot, to discover pairs with: source (j, uj, vj) to receiver (i, ui, vi)."""
+
     i: "mi.UInt32"
     ui: "mi.Float"
     vi: "mi.Float"
     j: "mi.UInt32"
     uj: "mi.Float"
     vj: "mi.Float"
-    pair: "mi.UInt32"       # where each ray stands in the pair tree, NONE before its root exists
+    pair: "mi.UInt32"  # where each ray stands in the pair tree, NONE before its root exists
 
 
 def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, progress=lambda done: None):
@@ -68,25 +71,43 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
     elements, model = pairs.elements, pairs.elements.model
     leaves = elements.leaf_indices()
     area = mi.Float64(dr.gather(mi.Float, elements.open_area, leaves))
-    divided = dr.gather(mi.UInt32, leaves, dr.compress(dr.gather(mi.Bool, elements.divided, leaves))) if record is None else None
+    divided = (
+        dr.gather(mi.UInt32, leaves, dr.compress(dr.gather(mi.Bool, elements.divided, leaves)))
+        if record is None
+        else None
+    )
     reflectance = dr.gather(mi.Color3f, elements.reflectance, leaves)
     emission = dr.gather(mi.Color3f, model.emission, dr.gather(mi.UInt32, elements.patch, leaves))
-    power = [mi.Float64(e) * area for e in emission]                # unshot, per channel [leaves]
+    power = [mi.Float64(e) * area for e in emission]  # unshot, per channel [leaves]
     direct, indirect = ([dr.zeros(mi.Float64, dr.width(leaves)) for _ in range(3)] for _ in range(2))
 
     flow = Flow()
     unshot = flow.emitted = totals(power)
     share, left, shot, seats = first_share, rays, 0.0, None
     while left > 0 and sum(unshot) > 0:
-        last = flow.iterations > 0 and (flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted))
+        last = flow.iterations > 0 and (
+            flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted)
+        )
         count = left if last else min(left, max(64, round(left * share)))
         if record is None:
-            sums, seats = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: progress(rays - left + cast), seats)
+            sums, seats = _shoot(
+                pairs,
+                leaves,
+                power,
+                unshot,
+                count,
+                flow.iterations,
+                seed,
+                lambda cast: progress(rays - left + cast),
+                seats,
+            )
             if dr.width(divided):
                 leaf = dr.repeat(divided, SEATS)
                 note_light(elements, leaf, *seats.points(leaf, dr.arange(mi.UInt32, dr.width(leaf))))
         else:
-            sums, rays_seen = _shoot(pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: None, pilot=True)
+            sums, rays_seen = _shoot(
+                pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: None, pilot=True
+            )
             record.append(rays_seen)
         left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
@@ -98,7 +119,9 @@ def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, pr
         first = flow.iterations == 0
         for c in range(3):
             once, more = received[c], received[c] * dr.opaque(mi.Float64, closure[c] - first)
-            direct[c], indirect[c] = (direct[c] + once, indirect[c] + more) if first else (direct[c], indirect[c] + more)
+            direct[c], indirect[c] = (
+                (direct[c] + once, indirect[c] + more) if first else (direct[c], indirect[c] + more)
+            )
             lost = [sums.gather(opaque_index(len(elements) + k))[c][0] * scale[c] * closure[c] for k in range(2)]
             flow.escaped[c] += lost[0]
             flow.blocked[c] += lost[1]
@@ -158,7 +181,11 @@ def _shoot(pairs, leaves, power, unshot, count, iteration, seed, progress, seats
         pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
         receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
         if not pilot:
-            vetted = known & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0) & ~dr.gather(mi.Bool, pairs.partial, pair, known)
+            vetted = (
+                known
+                & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0)
+                & ~dr.gather(mi.Bool, pairs.partial, pair, known)
+            )
             vetted &= ~dr.gather(mi.Bool, elements.divided, receiver, known)
             receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
         bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
@@ -188,14 +215,17 @@ class Seats:
 
     def take(self, leaf, u, v, ray, active):
         """Offer the patch points (u, v) where rays (UInt32 [n]) meet leaves."""
-        dr.eval(leaf, u, v, active)         # lest the rays be traced again
+        dr.eval(leaf, u, v, active)  # lest the rays be traced again
         offer = dr.compress(active)
         if dr.width(offer) == 0:
             return
         # The least of well mixed numbers: any of them, but the same on any number of threads.
         ray = dr.gather(mi.UInt32, ray, offer)
         number = hash_pair(ray, 0)
-        seat, lot = SEATS * dr.gather(mi.UInt32, leaf, offer) + number % SEATS, (mi.UInt64(number) << 32) | mi.UInt64(ray)
+        seat, lot = (
+            SEATS * dr.gather(mi.UInt32, leaf, offer) + number % SEATS,
+            (mi.UInt64(number) << 32) | mi.UInt64(ray),
+        )
         dr.scatter_reduce(dr.ReduceOp.Min, self._least, lot, seat, mode=dr.ReduceMode.Direct)
         drawn = dr.gather(mi.UInt64, self._least, seat) == lot
         for points, x in zip(self._uv, (u, v)):

@@ -1,14 +1,15 @@
 """Parts of elements that nothing reaches: behind a skirting board, under the leg of a chair, under a rug."""
+
 import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import cosine_direction, kronecker, triangle
-from .arrays import ColorSums, opaque_index
+from ..core.points import cosine_direction, kronecker, triangle
+from ..core.arrays import ColorSums, opaque_index
 from .elements import NODES
 
-GLANCE, LOOK = 8, 64        # points per leaf: of all leaves, and of those with a covered point
-LEAST = 1 / 128             # no open share is smaller, so that nothing divides by zero
+GLANCE, LOOK = 8, 64  # points per leaf: of all leaves, and of those with a covered point
+LEAST = 1 / 128  # no open share is smaller, so that nothing divides by zero
 
 
 def find_covered(elements, seed):
@@ -76,12 +77,12 @@ def _covered_share(elements, leaves, points, seed):
     return mi.Float(dr.block_sum(dr.select(covered, mi.UInt32(1), 0), points)) / mi.Float(each)
 
 
-def is_covered(elements, leaf, u, v, s=.3, t=.6):
+def is_covered(elements, leaf, u, v, s=0.3, t=0.6):
     """Are patch points (u, v) of leaves covered (Bool [n])? s, t: two numbers that say where rays look."""
     model, patch = elements.model, dr.gather(mi.UInt32, elements.patch, leaf)
     normal, lamp = dr.gather(mi.Vector3f, model.normal, patch), dr.max(dr.gather(mi.Color3f, model.emission, patch)) > 0
     origin, aside = model.leave(patch, u, v, s, t)
-    other = cosine_direction(normal, 1 - s, dr.select(t < .5, t + .5, t - .5))
+    other = cosine_direction(normal, 1 - s, dr.select(t < 0.5, t + 0.5, t - 0.5))
 
     def inside(direction, active):
         hit = model.trace(origin, direction, active)

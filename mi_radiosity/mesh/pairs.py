@@ -1,15 +1,16 @@
 """The pair tree: which elements exchange power, and what the oracle said of them."""
+
 import drjit as dr
 import mitsuba as mi
 
 from ..oracles import KernelSamples, Pair
 from ..scene.model import NONE
-from ..scene.sampling import hash_pair, kronecker, triangle
-from .arrays import concat, lower_bound, lower_bound_within, opaque_index, unique
+from ..core.points import hash_pair, kronecker, triangle
+from ..core.arrays import concat, lower_bound, lower_bound_within, opaque_index, unique
 from .elements import MAX_LEVEL
 
-UNKNOWN = -1.0          # σ of a pair nobody has evaluated
-BATCH = 1 << 18         # pairs sampled in one launch: bounds memory
+UNKNOWN = -1.0  # σ of a pair nobody has evaluated
+BATCH = 1 << 18  # pairs sampled in one launch: bounds memory
 
 
 class Pairs:
@@ -26,7 +27,7 @@ class Pairs:
     def __init__(self, elements, oracle, lines, seed):
         self.elements, self.oracle, self.lines = elements, oracle, lines
         self.seed = dr.opaque(mi.UInt32, seed)
-        self.root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)      # a sentinel, so that the table is never empty
+        self.root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)  # a sentinel, so that the table is never empty
         self.roots = mi.UInt32(NONE)
         self._index_rows()
         # Pair 0 is never used, so that child == 0 means none.
@@ -93,7 +94,11 @@ class Pairs:
         """Ask the oracle for σ of ``pairs`` (UInt32 [n], none evaluated before)."""
         n = dr.width(pairs)
         for start in range(0, n, BATCH):
-            batch = dr.gather(mi.UInt32, pairs, opaque_index(start) + dr.arange(mi.UInt32, min(BATCH, n - start))) if n > BATCH else pairs
+            batch = (
+                dr.gather(mi.UInt32, pairs, opaque_index(start) + dr.arange(mi.UInt32, min(BATCH, n - start)))
+                if n > BATCH
+                else pairs
+            )
             self._evaluate(batch)
         self.evaluated += n
 
@@ -106,7 +111,13 @@ class Pairs:
             samples = KernelSamples(values, self.lines)
             dr.scatter(self.partial, samples.min() <= 0, pairs)
         receiver, source = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        pair = Pair(mi.Float64(dr.gather(mi.Float, e.area, receiver)), mi.Float64(dr.gather(mi.Float, e.area, source)), e.model.total_area)
+        pair = Pair(
+            mi.Float64(dr.gather(mi.Float, e.area, receiver)),
+            mi.Float64(dr.gather(mi.Float, e.area, source)),
+            e.model.total_area,
+            dr.gather(mi.UInt32, e.place, receiver) & 15,
+            dr.gather(mi.UInt32, e.place, source) & 15,
+        )
         sigma = self.oracle.sigma(samples, pair)
         dr.scatter(self.sigma, dr.maximum(mi.Float(sigma), 0), pairs)
         dr.eval(self.sigma, self.partial)
@@ -131,7 +142,7 @@ class Pairs:
         """The element that splits when a pair is rejected: the larger of two (UInt32 [n], NONE if it cannot)."""
         e = self.elements
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        finest = 2.0 ** -MAX_LEVEL
+        finest = 2.0**-MAX_LEVEL
         free_i, free_j = (dr.abs(dr.gather(mi.Float, e.scale, k)) > finest for k in (i, j))
         larger_i = dr.gather(mi.Float, e.area, i) >= dr.gather(mi.Float, e.area, j)
         return dr.select(free_i & (larger_i | ~free_j), i, dr.select(free_j, j, NONE))
@@ -148,6 +159,10 @@ class Pairs:
         half = dr.gather(mi.UInt32, self.elements.child, split) + k % 4
         receiver, source = dr.gather(mi.UInt32, self.receiver, parent), dr.gather(mi.UInt32, self.source, parent)
         of_receiver = receiver == split
-        dr.scatter(self.halved, 2 * element + dr.select(element == dr.gather(mi.UInt32, self.receiver, chosen), mi.UInt32(1), 0), chosen)
+        dr.scatter(
+            self.halved,
+            2 * element + dr.select(element == dr.gather(mi.UInt32, self.receiver, chosen), mi.UInt32(1), 0),
+            chosen,
+        )
         self._append(dr.select(of_receiver, half, receiver), dr.select(of_receiver, source, half))
         dr.eval(self.receiver, self.source, self.child, self.halved, self.sigma, self.partial)

@@ -1,13 +1,21 @@
 """The element tree: patches split 1→4 into triangles."""
+
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.sampling import hash_pair
-from .arrays import concat, opaque_index
+from ..core.points import hash_pair
+from ..core.arrays import concat, opaque_index
 
-NODES = ((0., 0.), (1., 0.), (0., 1.), (.5, .5), (0., .5), (.5, 0.))     # of an element: corners, and middles opposite them
-TUCK = 2.0 ** -14   # how far inside of its element a node is when something is looked for between it and others
-MAX_LEVEL = 14      # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
+NODES = (
+    (0.0, 0.0),
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (0.5, 0.5),
+    (0.0, 0.5),
+    (0.5, 0.0),
+)  # of an element: corners, and middles opposite them
+TUCK = 2.0**-14  # how far inside of its element a node is when something is looked for between it and others
+MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
 
 
 class Elements:
@@ -61,7 +69,7 @@ class Elements:
         k = dr.arange(mi.UInt32, 4 * count)
         parent, which = dr.gather(mi.UInt32, chosen, k // 4), k % 4
         patch = dr.gather(mi.UInt32, self.patch, parent)
-        half = dr.gather(mi.Float, self.scale, parent) * .5
+        half = dr.gather(mi.Float, self.scale, parent) * 0.5
         u0 = dr.gather(mi.Float, self.u0, parent) + dr.select((which == 1) | (which == 3), half, 0)
         v0 = dr.gather(mi.Float, self.v0, parent) + dr.select(which >= 2, half, 0)
         scale = dr.select(which == 3, -half, half)
@@ -75,10 +83,12 @@ class Elements:
         self.place = concat(self.place, place + 1 + (which << (2 + 2 * (MAX_LEVEL - (place & 15)))))
         self.u0, self.v0 = concat(self.u0, u0), concat(self.v0, v0)
         self.scale = concat(self.scale, scale)
-        self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * .25)
+        self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * 0.25)
         self.reflectance = concat(self.reflectance, reflectance)
         self.leaves += 3 * count
-        dr.eval(self.patch, self.parent, self.child, self.place, self.u0, self.v0, self.scale, self.area, self.reflectance)
+        dr.eval(
+            self.patch, self.parent, self.child, self.place, self.u0, self.v0, self.scale, self.area, self.reflectance
+        )
 
     def _mean_reflectance(self, patch, u0, v0, scale):
         """ρ averaged over four points of each element (Color3f)."""
@@ -133,7 +143,9 @@ class Elements:
 
     def in_sight(self, element, u, v, a, b, active=True):
         """Is nothing between patch points (u, v) of elements and their nodes (a, b) (Bool [n])?"""
-        return ~self.model.walled(dr.gather(mi.UInt32, self.patch, element, active), u, v, *self.node_point(element, a, b), active)
+        return ~self.model.walled(
+            dr.gather(mi.UInt32, self.patch, element, active), u, v, *self.node_point(element, a, b), active
+        )
 
     def patch_point(self, element, a, b):
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
@@ -143,4 +155,6 @@ class Elements:
 
 def child_at(a, b):
     """Which child holds a point (a, b) of an element; 3 is the middle one."""
-    return dr.select(a >= .5, mi.UInt32(1), dr.select(b >= .5, mi.UInt32(2), dr.select(a + b <= .5, mi.UInt32(0), mi.UInt32(3))))
+    return dr.select(
+        a >= 0.5, mi.UInt32(1), dr.select(b >= 0.5, mi.UInt32(2), dr.select(a + b <= 0.5, mi.UInt32(0), mi.UInt32(3)))
+    )

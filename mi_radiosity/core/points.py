@@ -6,12 +6,13 @@ one element are stratified whatever their number, and so are the lines of one pa
 The shift s is a hash of a key, which makes the estimates unbiased over seeds and independent
 between keys, threads and array sizes.
 """
+
 import drjit as dr
 import mitsuba as mi
 
 _PHI = 1.1673039782614187
-ROUNDS = 8      # of the hash: with Mitsuba's 4, the numbers of neighbouring keys and seeds go together
-STEPS = tuple(round(_PHI ** -(d + 1) * 2 ** 32) for d in range(4))
+ROUNDS = 8  # of the hash: with Mitsuba's 4, the numbers of neighbouring keys and seeds go together
+STEPS = tuple(round(_PHI ** -(d + 1) * 2**32) for d in range(4))
 
 
 def kronecker(index, key, seed, owner=None):
@@ -22,11 +23,10 @@ def kronecker(index, key, seed, owner=None):
     """
     shifts = [*mi.sample_tea_32(key, seed, ROUNDS), *mi.sample_tea_32(key ^ 0x9E3779B9, seed, ROUNDS)]
     if owner is not None or dr.width(key) == 1:
-        dr.eval(shifts)             # hash once per key, not once per point
+        dr.eval(shifts)  # hash once per key, not once per point
     if owner is not None:
         shifts = [dr.gather(mi.UInt32, shift, owner) for shift in shifts]
-    return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0 ** -24
-                 for shift, step in zip(shifts, STEPS))
+    return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0**-24 for shift, step in zip(shifts, STEPS))
 
 
 def hash_pair(a, b):

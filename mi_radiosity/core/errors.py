@@ -1,4 +1,6 @@
 """The errors a user can cause and mend; each message is one line that says what to do."""
+
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 
@@ -7,12 +9,15 @@ class RadiosityError(ValueError):
 
 
 @contextmanager
-def interruptible():
-    """Let Ctrl-C out of the body as KeyboardInterrupt: loops of Dr.Jit and imports of extensions wrap it in other errors."""
+def interruptible() -> Iterator[None]:
+    """Let Ctrl-C out of the body as KeyboardInterrupt.
+
+    Loops of Dr.Jit and imports of extensions wrap it in other errors.
+    """
     try:
         yield
     except Exception as error:
-        cause = error
+        cause: BaseException | None = error
         while cause is not None:
             if isinstance(cause, KeyboardInterrupt):
                 raise KeyboardInterrupt from None

@@ -1,4 +1,5 @@
 """Small array tools: searching, and sums that come out the same on any number of threads."""
+
 import math
 
 import drjit as dr
@@ -26,7 +27,9 @@ def unique(keys):
     """Sorted keys without repetitions (UInt64)."""
     keys = dr.sort(keys)
     k = dr.arange(mi.UInt32, dr.width(keys))
-    keys = dr.gather(mi.UInt64, keys, dr.compress((k == 0) | (keys != dr.gather(mi.UInt64, keys, dr.maximum(k, 1) - 1))))
+    keys = dr.gather(
+        mi.UInt64, keys, dr.compress((k == 0) | (keys != dr.gather(mi.UInt64, keys, dr.maximum(k, 1) - 1)))
+    )
     dr.eval(keys)
     return keys
 
@@ -59,7 +62,7 @@ class ColorSums:
     def __init__(self, bins, bound):
         self.bins = bins
         # Powers of two: a bound that differs in the last bit gives the same fixed point.
-        self.unit = [power_of_two(b) * 2.0 ** -60 for b in bound]
+        self.unit = [power_of_two(b) * 2.0**-60 for b in bound]
         self._to_fixed = [dr.opaque(mi.Float64, 1 / u) for u in self.unit]
         self._to_float = [dr.opaque(mi.Float64, u) for u in self.unit]
         self._sums = [dr.zeros(mi.Int64, bins) for _ in range(3)]

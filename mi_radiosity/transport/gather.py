@@ -1,17 +1,18 @@
 """Irradiance of patches too small for the rays to find."""
+
 import drjit as dr
 import mitsuba as mi
 
 from ..scene.model import NONE
-from ..scene.sampling import ROUNDS, kronecker, triangle
-from .arrays import lower_bound, opaque_index, totals
-from .power import WEIGHTS, pull
+from ..core.points import ROUNDS, kronecker, triangle
+from ..core.arrays import lower_bound, opaque_index, totals
+from .series import WEIGHTS, pull
 
-ENOUGH = 16             # rays a patch should expect
-SAMPLES = 32            # lines to lamps, and as many rays into the room, per starved leaf;
-MOST_SAMPLES = 1024     # more of them while that takes no more than
-CHEAP = 0.02            # of the ray budget,
-SHARE = 0.2             # and fewer so that it never takes more than this
+ENOUGH = 16  # rays a patch should expect
+SAMPLES = 32  # lines to lamps, and as many rays into the room, per starved leaf;
+MOST_SAMPLES = 1024  # more of them while that takes no more than
+CHEAP = 0.02  # of the ray budget,
+SHARE = 0.2  # and fewer so that it never takes more than this
 
 
 class Starved:
@@ -73,7 +74,9 @@ class Starved:
         cumulative = dr.cumsum(mi.UInt64(dr.ceil(power * dr.opaque(mi.Float64, WEIGHTS / whole))))
         dr.eval(cumulative)
         # Stratified over the lamps' power.
-        draw = (mi.Float64(line) + mi.sample_tea_float32(key ^ 0xA511E9B3, self.seed, ROUNDS)) / mi.Float64(opaque_index(self.samples))
+        draw = (mi.Float64(line) + mi.sample_tea_float32(key ^ 0xA511E9B3, self.seed, ROUNDS)) / mi.Float64(
+            opaque_index(self.samples)
+        )
         j = lower_bound(cumulative, mi.UInt64(draw * dr.opaque(mi.Float64, WEIGHTS)) + 1)
         E = dr.gather(mi.Color3f, emission, j)
         F = model.kernel(patch, u, v, dr.gather(mi.UInt32, lamps, j), *triangle(s, t))

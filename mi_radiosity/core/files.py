@@ -1,4 +1,5 @@
 """Output files that are whole or not there."""
+
 import os
 import tempfile
 from contextlib import contextmanager

@@ -1,0 +1,80 @@
+"""Point Dr.Jit at the LLVM that pip installed.
+
+Dr.Jit loads LLVM while it is imported and never looks again, so `choose_llvm` runs before anything
+imports ``drjit``.  A library the user chose (``DRJIT_LIBLLVM_PATH``) always wins.
+"""
+
+import ctypes
+import importlib.metadata
+import os
+import sys
+
+from .errors import RadiosityError
+
+WHEEL = "karellen-llvm-core"
+OLDEST = (17,)
+
+
+def _files(pattern: str) -> list[str]:
+    """Installed files of the LLVM wheel whose name starts with ``pattern``."""
+    try:
+        files = importlib.metadata.files(WHEEL) or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    return sorted(str(f.locate().resolve()) for f in files if f.name.startswith(pattern))
+
+
+def choose_llvm() -> None:
+    """Set ``DRJIT_LIBLLVM_PATH`` to the wheel's libLLVM unless a choice was already made."""
+    if "drjit" in sys.modules or "DRJIT_LIBLLVM_PATH" in os.environ:
+        return
+    libraries = _files("libLLVM")
+    if not libraries:
+        return
+    # The wheel links its C++ runtime only at the next interpreter start: load it by hand until then.
+    # Locally: a global libc++abi would take over Mitsuba's exceptions, and its errors would abort.
+    for name in ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1"):
+        for path in _files(name)[:1]:
+            try:
+                ctypes.CDLL(path, mode=ctypes.RTLD_LOCAL)
+            except OSError:
+                pass
+    os.environ["DRJIT_LIBLLVM_PATH"] = libraries[0]
+
+
+def problem() -> str | None:
+    """One line that says what is wrong with the LLVM Dr.Jit has loaded and what mends it, or None."""
+    import drjit as dr
+
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        found = "Dr.Jit found no LLVM"
+    elif tuple(dr.detail.llvm_version()) < OLDEST:
+        found = f"LLVM {'.'.join(map(str, dr.detail.llvm_version()))} is too old for Dr.Jit"
+    else:
+        return None
+    if "DRJIT_LIBLLVM_PATH" in os.environ:
+        chosen = os.environ["DRJIT_LIBLLVM_PATH"]
+        return (
+            f"{found}: DRJIT_LIBLLVM_PATH is {chosen}; set it to the library of LLVM {OLDEST[0]} or newer, or unset it"
+        )
+    libraries = _files("libLLVM")
+    if libraries:
+        return f"{found}: import mi_radiosity before mitsuba and drjit, or `export DRJIT_LIBLLVM_PATH={libraries[0]}`"
+    return (
+        f"{found}: `pip install {WHEEL}` (Linux x86_64), or install LLVM {OLDEST[0]} or newer and set "
+        "DRJIT_LIBLLVM_PATH to its library"
+    )
+
+
+def require_variant() -> None:
+    """Raise RadiosityError unless the active Mitsuba variant can run our kernels. Every public entry asks."""
+    import mitsuba as mi
+
+    variant = mi.variant() or "none"
+    if not variant.startswith(("llvm_", "cuda_")) or "rgb" not in variant:
+        raise RadiosityError(
+            f"the Mitsuba variant '{variant}' cannot be used: choose llvm_ad_rgb or cuda_ad_rgb "
+            "with mi.set_variant(...) or -m"
+        )
+    if variant.startswith("llvm_") and (wrong := problem()):
+        raise RadiosityError(wrong)
