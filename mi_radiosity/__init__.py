@@ -6,25 +6,33 @@ _choose_llvm()  # before anything imports drjit
 
 import mitsuba as _mi
 
-from .display import register as _register
 from .core.errors import RadiosityError
+from .display import Shader
+from .display import register as _register
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
+from .scene import Light, mesher
 from .solver import Solution, solve
+from .transport import Shooting, Transport
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
-    "solve",
-    "Solution",
-    "Oracle",
-    "Pair",
-    "KernelSamples",
     "GMI",
     "KS",
     "MI",
+    "KernelSamples",
+    "Light",
+    "Oracle",
+    "Pair",
     "Power",
+    "RadiosityError",
+    "Shader",
+    "Shooting",
+    "Solution",
+    "Transport",
     "Uniform",
     "information_gap",
-    "RadiosityError",
+    "mesher",
+    "solve",
 ]
 
 _register()

@@ -51,16 +51,16 @@ def rectangle(to_world=None, **parts):
 
 def leaf_values(solution, name="radiosity"):
     """(values [leaves, 3], open areas [leaves], patches [leaves]) of a solution's leaves as NumPy arrays."""
-    leaves = np.flatnonzero(np.array(solution.elements.child) == 0)
+    leaves = np.array(solution.elements.leaves)
     values = getattr(solution, name)
     values = np.array(values() if callable(values) else values).reshape(3, -1).T[leaves]
-    return values, np.array(solution.elements.open_area)[leaves], np.array(solution.elements.patch)[leaves]
+    return values, np.array(solution.exposure.open_area)[leaves], np.array(solution.elements.patch)[leaves]
 
 
 def partition(solution):
     """The area of the leaves of every patch [patches]."""
     child, area, patch = (np.array(getattr(solution.elements, name)) for name in ("child", "area", "patch"))
-    return np.bincount(patch[child == 0], weights=area[child == 0], minlength=solution.model.count)
+    return np.bincount(patch[child == 0], weights=area[child == 0], minlength=solution.model.patches.count)
 
 
 def mesh(vertices, faces, bsdf=None, emitter=None, name=""):
@@ -133,7 +133,7 @@ def icosphere(subdivisions, inwards=True):
 
 def group(model, reflectance):
     """Numbers of the patches with a reflectance (UInt32 NumPy array): how tests tell surfaces apart."""
-    return np.flatnonzero(np.isclose(np.array(model.reflectance)[0], reflectance, atol=1e-6)).astype(np.uint32)
+    return np.flatnonzero(np.isclose(np.array(model.patches.reflectance)[0], reflectance, atol=1e-6)).astype(np.uint32)
 
 
 def balance(solution):
@@ -144,20 +144,13 @@ def balance(solution):
 
 def leaf_corners(solution):
     """Corners of the leaves in the coordinates of the scene [leaves, 3, 3]."""
-    e, model = solution.elements, solution.model
-    leaf = mi.UInt32(np.flatnonzero(np.array(e.child) == 0).astype(np.uint32))
-    patch = dr.gather(mi.UInt32, e.patch, leaf)
-    corners = [
-        np.array(model.point(patch, *e.patch_point(leaf, mi.Float(a), mi.Float(b)))).T
-        for a, b in ((0, 0), (1, 0), (0, 1))
-    ]
-    return np.stack(corners, axis=1) + model.centre
+    return solution.leaves().vertices
 
 
 def border_values(solution):
     """Field values on the borders of all leaves at dyadic points that are shown: positions [n, 3], normals, values [n, 3], shapes [n]."""
     e, model = solution.elements, solution.model
-    leaves = np.flatnonzero(np.array(e.child) == 0).astype(np.uint32)
+    leaves = np.array(e.leaves)
     level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)
     finest = min(level.max(), 9)
     steps = 2 ** np.maximum(finest - level, 0)
@@ -170,14 +163,14 @@ def border_values(solution):
     index = mi.UInt32(leaf)
     u, v = e.patch_point(index, mi.Float(a), mi.Float(b))
     patch = dr.gather(mi.UInt32, e.patch, index)
-    shown = ~np.array(is_covered(e, index, u, v)).astype(bool)
+    shown = ~np.array(is_covered(e, model.rays, index, u, v)).astype(bool)
     found = (
         mi_radiosity.display.Field(solution).at(index, u, v),
-        model.point(patch, u, v),
-        dr.gather(mi.Vector3f, model.normal, patch),
+        model.patches.point(patch, u, v),
+        dr.gather(mi.Vector3f, model.patches.normal, patch),
     )
     values, points, normals = (np.array(x).T[shown] for x in found)
-    return points, normals, values, model.faces.shape[np.array(dr.gather(mi.UInt32, model.face, patch))[shown]]
+    return points, normals, values, model.faces.shape[np.array(dr.gather(mi.UInt32, model.patches.face, patch))[shown]]
 
 
 def gaps_between_leaves(solution):
@@ -194,7 +187,7 @@ def gaps_between_leaves(solution):
 def wall_means(solution):
     """Mean radiosity of every wall {number: [3]}; what lies inside solids counts as dark, as it does for others."""
     values, areas, patches = leaf_values(solution)
-    walls, whole = names_of_walls(solution.model), np.array(solution.model.area)
+    walls, whole = names_of_walls(solution.model), np.array(solution.model.patches.area)
     return {
         wall: areas[walls[patches] == wall] @ values[walls[patches] == wall] / whole[walls == wall].sum()
         for wall in np.unique(walls)
@@ -203,6 +196,6 @@ def wall_means(solution):
 
 def names_of_walls(model):
     """One number per patch, the same for patches of one reflectance in one plane."""
-    normal, point = np.array(model.normal).T, np.array(model.p0).T
-    key = np.column_stack([normal, (normal * point).sum(axis=1), np.array(model.reflectance).T]).round(2) + 0.0
+    normal, point = np.array(model.patches.normal).T, np.array(model.patches.p0).T
+    key = np.column_stack([normal, (normal * point).sum(axis=1), np.array(model.patches.reflectance).T]).round(2) + 0.0
     return np.unique(key, axis=0, return_inverse=True)[1].ravel()

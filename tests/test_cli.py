@@ -141,7 +141,7 @@ def test_interrupt(tmp_path, monkeypatch, capsys):
 
 def test_interrupt_inside_a_loop_of_drjit(tmp_path, monkeypatch):
     """Dr.Jit wraps the interrupt in a RuntimeError; it still is one."""
-    from mi_radiosity.solver import elements
+    from mi_radiosity.mesh import elements
 
     def stop(*_):
         raise KeyboardInterrupt

@@ -57,7 +57,7 @@ def test_sphere_with_a_lit_cap(lit, unlit, cap):
     solution = mr.solve(ball, elements=1280, rays=2_000_000)
     H = f / (1 - f * lit - (1 - f) * unlit)
     values, areas, patches = leaf_values(solution)
-    emits = np.array(dr.max(solution.model.emission) > 0)[patches]
+    emits = np.array(dr.max(solution.model.patches.emission) > 0)[patches]
     assert np.average(values[emits, 0], weights=areas[emits]) == pytest.approx(1 + lit * H, rel=0.01)
     assert np.average(values[~emits, 0], weights=areas[~emits]) == pytest.approx(unlit * H, rel=0.01)
 
@@ -134,16 +134,23 @@ def full_matrix(cornell):
             (a, b, -1) for a in range(1, n) for b in range(1, n - a + 1)
         ]
 
-    up, large = np.array(model.normal)[1] > 0.99, np.array(model.area) > 1
+    up, large = np.array(model.patches.normal)[1] > 0.99, np.array(model.patches.area) > 1
     patch_steps = np.where(up & large, FLOOR, np.where(large, WALLS, BOXES))
     u, v, sign = (x[:, None] for x in np.concatenate([grid(n) for n in patch_steps]).T)
-    cell = np.repeat(np.arange(model.count), patch_steps**2)
+    cell = np.repeat(np.arange(model.patches.count), patch_steps**2)
     steps = patch_steps[cell][:, None]
     p0, e1, e2, normal, rho, E = (
         np.array(x, dtype=float).T[cell]
-        for x in (model.p0, model.e1, model.e2, model.normal, model.reflectance, model.emission)
+        for x in (
+            model.patches.p0,
+            model.patches.e1,
+            model.patches.e2,
+            model.patches.normal,
+            model.patches.reflectance,
+            model.patches.emission,
+        )
     )
-    area, n = np.array(model.area, dtype=float)[cell] / steps[:, 0] ** 2, len(cell)
+    area, n = np.array(model.patches.area, dtype=float)[cell] / steps[:, 0] ** 2, len(cell)
 
     def point(c, a, b):
         return p0[c] + e1[c] * (u[c] + sign[c] * a) / steps[c] + e2[c] * (v[c] + sign[c] * b) / steps[c]
@@ -159,7 +166,7 @@ def full_matrix(cornell):
             facing = np.flatnonzero(((normal[i] * d).sum(axis=1) > 1e-6) & ((normal[j] * d).sum(axis=1) < -1e-6))
             i, j, x, d = i[facing], j[facing], x[facing], d[facing]
             ray = mi.Ray3f(
-                mi.Point3f((x + 1e-5 * normal[i] + model.centre).T.astype(np.float32)),
+                mi.Point3f((x + 1e-5 * normal[i] + model.faces.centre).T.astype(np.float32)),
                 mi.Vector3f((d + 1e-5 * (normal[j] - normal[i])).T.astype(np.float32)),
             )
             ray.maxt = 0.9999
@@ -187,7 +194,7 @@ def cornell_walls(cornell):
 def test_full_matrix_solution_of_the_cornell_box(full_matrix, cornell_walls):
     """All walls within 1.5 % of a dense solver that shares nothing with ours; the sides of boxes, which its cells on the floor serve badly, within 5 %."""
     ours, model = cornell_walls
-    walls, normal, area = names_of_walls(model), np.array(model.normal).T, np.array(model.area)
+    walls, normal, area = names_of_walls(model), np.array(model.patches.normal).T, np.array(model.patches.area)
     assert set(ours) == set(full_matrix) == set(range(15))
     for wall in ours:
         here = walls == wall
@@ -198,7 +205,7 @@ def test_full_matrix_solution_of_the_cornell_box(full_matrix, cornell_walls):
 def path_means(model, samples=1 << 18):
     """Mean B of every wall by Mitsuba's path integrator, looking at random points of patches from nearby, and its standard error."""
     random = np.random.default_rng(0)
-    area, walls = np.array(model.area, dtype=float), names_of_walls(model)
+    area, walls = np.array(model.patches.area, dtype=float), names_of_walls(model)
     path, sampler, result = (
         mi.load_dict({"type": "path", "max_depth": -1, "rr_depth": 20}),
         mi.load_dict({"type": "independent"}),
@@ -209,8 +216,10 @@ def path_means(model, samples=1 << 18):
         patch = mi.UInt32(random.choice(here, samples, p=area[here] / area[here].sum()).astype(np.uint32))
         u, v = random.random((2, samples)).astype(np.float32)
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-        normal = dr.gather(mi.Vector3f, model.normal, patch)
-        ray = mi.Ray3f(model.point(patch, mi.Float(u), mi.Float(v)) + model.origin + 1e-4 * normal, -normal)
+        normal = dr.gather(mi.Vector3f, model.patches.normal, patch)
+        ray = mi.Ray3f(
+            model.patches.point(patch, mi.Float(u), mi.Float(v)) + model.patches.origin + 1e-4 * normal, -normal
+        )
         sampler.seed(int(wall), samples)
         B = np.pi * np.array(path.sample(model.scene, sampler, mi.RayDifferential3f(ray))[0]).reshape(3, -1)
         result[wall] = B.mean(axis=1), B.std(axis=1) / samples**0.5

@@ -9,10 +9,9 @@ from scipy import stats
 
 import mi_radiosity as mr
 from mi_radiosity.scene import Model
-from mi_radiosity.scene.model import NONE
+from mi_radiosity.core.arrays import NONE
 from mi_radiosity.core.points import kronecker, triangle
-from mi_radiosity.mesh.elements import Elements
-from mi_radiosity.mesh.pairs import Pairs
+from mi_radiosity.mesh import Pairs, Tree
 
 A, B, OTHER = 0.1, 0.2, 0.3  # reflectances that name the two plates and what stands between
 C11 = {(1, 1): 0.19982489569838, (2, 1): 0.28587538485071, (0.5, 4): 0.1985885560012}
@@ -63,11 +62,11 @@ def contour(p, q, nodes=160):
 
 def estimates(model, lines, seeds=SEEDS, first_seed=0):
     """F_AB by the solver's kernel samples, ``lines`` per pair of patches, for several seeds."""
-    a, b, area = group(model, A), group(model, B), np.array(model.area, dtype=float)
+    a, b, area = group(model, A), group(model, B), np.array(model.patches.area, dtype=float)
     i, j = (np.ascontiguousarray(x.ravel()) for x in np.meshgrid(a, b, indexing="ij"))
     results = []
     for seed in range(first_seed, first_seed + seeds):
-        pairs = Pairs(Elements(model), mr.GMI(), lines, seed)
+        pairs = Pairs(Tree(model.patches, model.materials), model.rays, mr.GMI(), lines, seed)
         pairs.add_roots(mi.UInt32(i), mi.UInt32(j))
         F = np.array(
             pairs.kernel_samples(pairs.find_roots(mi.UInt32(i), mi.UInt32(j), dr.full(mi.Bool, True, len(i)))),
@@ -88,13 +87,13 @@ def rays_from(model, patches, rays, seed=0):
     k = dr.arange(mi.UInt32, len(patches) * rays)
     patch = dr.gather(mi.UInt32, mi.UInt32(patches), k // rays)
     u, v, s, t = kronecker(k % rays, patch, mi.UInt32(seed))
-    hit = model.trace(*model.leave(patch, *triangle(u, v), s, t))
+    hit = model.rays.trace(*model.rays.leave(patch, *triangle(u, v), s, t))
     return np.array(hit.patch).reshape(len(patches), rays)
 
 
 def by_rays(model, rays, seed=0):
     """F_AB as the share of rays from A that meet B, and its standard error."""
-    a, area = group(model, A), np.array(model.area)
+    a, area = group(model, A), np.array(model.patches.area)
     share = np.isin(rays_from(model, a, rays, seed), group(model, B)).mean(axis=1) @ area[a] / area[a].sum()
     return share, (share * (1 - share) / (rays * len(a))) ** 0.5
 
@@ -143,14 +142,14 @@ def test_coaxial_disks(r1, r2):
 def test_point_to_rectangle(a, b):
     """The kernel from one point under a corner of a rectangle."""
     model = parallel(a, b)
-    corners = np.array([np.array(model.corner(k)).T for k in range(3)])  # [3, patches, 3]
+    corners = np.array([np.array(model.patches.corners[k]).T for k in range(3)])  # [3, patches, 3]
     k, i = next((k, i) for i in group(model, A) for k in range(3) if not corners[k, i].any())
     n, targets, values = 4096, group(model, B), []
     for seed in range(SEEDS):
         line, j = dr.arange(mi.UInt32, n * len(targets)), dr.repeat(mi.UInt32(targets), n)
         u, v, _, _ = kronecker(line % n, j, mi.UInt32(seed))
-        F = np.array(model.kernel(mi.UInt32(int(i)), mi.Float(k == 1), mi.Float(k == 2), j, *triangle(u, v)))
-        values.append((F.reshape(-1, n).mean(axis=1) * np.array(model.area)[targets]).sum())
+        F = np.array(model.rays.kernel(mi.UInt32(int(i)), mi.Float(k == 1), mi.Float(k == 2), j, *triangle(u, v)))
+        values.append((F.reshape(-1, n).mean(axis=1) * np.array(model.patches.area)[targets]).sum())
     agree(np.array(values), B3[a, b])
 
 
@@ -191,10 +190,10 @@ def test_touching_patches(degrees, h, w, exact):
     # At 1° a few lines next to the edge hold most of F: their mean is known to 11 % only.
     assert estimates(model, 40_000).mean() == pytest.approx(exact, rel=0.02 if degrees > 1 else 0.2)
     for oracle in (mr.KS(), mr.MI(), mr.GMI(0.5), mr.GMI(1.5), mr.GMI(3), mr.Power(), mr.Uniform()):
-        pairs = Pairs(Elements(model), oracle, 10, 0)
+        pairs = Pairs(Tree(model.patches, model.materials), model.rays, oracle, 10, 0)
         pairs.add_roots(mi.UInt32(group(model, A)), mi.UInt32(group(model, B)))
         pairs.evaluate(dr.arange(mi.UInt32, len(pairs) - 1) + 1)
-        sigma = np.array(pairs.sigma)
+        sigma = np.array(pairs.sigma[0])
         assert np.isfinite(sigma).all() and (sigma >= 0).all(), oracle
 
 
@@ -216,16 +215,16 @@ def room():
 def test_closed_scenes_lose_no_ray():
     """Σ_j F_ij = 1: every ray of every patch meets a patch."""
     model = room()
-    met = rays_from(model, np.arange(model.count, dtype=np.uint32), 20_000)
+    met = rays_from(model, np.arange(model.patches.count, dtype=np.uint32), 20_000)
     assert (met != NONE).all()
 
 
 def test_reciprocity():
     """A_i F_ij = A_j F_ji for every pair of patches, to five standard errors."""
     model, rays = room(), 20_000
-    met = rays_from(model, np.arange(model.count, dtype=np.uint32), rays)
-    F = np.array([np.bincount(row, minlength=model.count) for row in met]) / rays
-    area = np.array(model.area)
+    met = rays_from(model, np.arange(model.patches.count, dtype=np.uint32), rays)
+    F = np.array([np.bincount(row, minlength=model.patches.count) for row in met]) / rays
+    area = np.array(model.patches.area)
     flow, variance = area[:, None] * F, area[:, None] ** 2 * np.maximum(F * (1 - F), 1 / rays) / rays
     assert (np.abs(flow - flow.T) < 5 * np.sqrt(variance + variance.T)).all()
 

@@ -51,7 +51,7 @@ def plate_is_lit(solution):
     """Floor under a ceiling of its size: H = F / (1 − ρ ρ' F²), to 1.5 %."""
     expected = C11_2 / (1 - FLOOR * LAMP * C11_2**2)
     assert mean(solution, FLOOR) == pytest.approx(expected, rel=0.015)
-    assert len(group(solution.model, FLOOR)) and np.array(solution.model.area)[
+    assert len(group(solution.model, FLOOR)) and np.array(solution.model.patches.area)[
         group(solution.model, FLOOR)
     ].sum() == pytest.approx(4, rel=1e-5)
 
@@ -361,7 +361,7 @@ def test_holds_for_every_oracle(case, oracle):
     parts, check = CASES[case]()
     model = Model(parts)
     # ρ = 0 leaves oracles nothing to refine: only a mesh that is not asked for by number may stay coarse.
-    few = {} if case == "rho 0" else {"elements": model.count + 1500}
+    few = {} if case == "rho 0" else {"elements": model.patches.count + 1500}
     solution = mr.solve(model, oracle, rays=300_000, **few)
     values, areas, _ = leaf_values(solution)
     assert np.isfinite(values).all() and (values >= 0).all()
@@ -381,8 +381,8 @@ def test_coincident_faces_do_not_speckle(other):
     grid = np.random.default_rng(0).uniform(-1, 1, (2, 20_000)).astype(np.float32)
     for slope in (0, 0.3, 3):
         x = mi.Point3f(mi.Float(grid[0]) - slope * 0.5, mi.Float(grid[1]), 0.5)
-        hit = model.trace(x, mi.Vector3f(slope, 0, -1) + mi.Vector3f(0 * x.x, 0 * x.x, 0 * x.x))
-        rho = np.array(model.reflectance)[0][np.array(hit.patch)]
+        hit = model.rays.trace(x, mi.Vector3f(slope, 0, -1) + mi.Vector3f(0 * x.x, 0 * x.x, 0 * x.x))
+        rho = np.array(model.patches.reflectance)[0][np.array(hit.patch)]
         assert np.ptp(rho) == 0
     assert any("lie in others" in w for w in model.warnings)
 

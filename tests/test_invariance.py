@@ -68,14 +68,14 @@ def test_scale_and_place_do_not_matter(scale, move, oracle, kept):
     )
 
     def leaves(solution, scale):
-        corners = (leaf_corners(solution) - solution.model.centre) / scale
+        corners = (leaf_corners(solution) - solution.model.faces.centre) / scale
         return np.column_stack([corners.mean(axis=1), np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)])
 
     distance, _ = cKDTree(leaves(reference, 1)).query(leaves(other, scale))
     assert (distance < 5e-3).mean() > (kept if rounded_corners(scale, move) < 1e-5 else 0.8)
     values = [solution.radiosity() for solution in (reference, other)]
     means = [
-        np.average(np.array(v)[0, : s.model.count], weights=np.array(s.model.area))
+        np.average(np.array(v)[0, : s.model.patches.count], weights=np.array(s.model.patches.area))
         for v, s in zip(values, (reference, other))
     ]
     assert means[1] == pytest.approx(means[0], rel=0.01)

@@ -79,14 +79,14 @@ def test_any_scene(parts, oracle, seed):
     """Energy kept, B ≥ 0 and finite, leaves partition patches, children fill parents, the picture has no cracks."""
     model = Model(parts)
     try:
-        solution = mr.solve(model, oracle, elements=model.count + 150, rays=4000, seed=seed)
+        solution = mr.solve(model, oracle, elements=model.patches.count + 150, rays=4000, seed=seed)
     except mr.RadiosityError as error:  # nothing near a lone lamp
         assert "nothing left to refine" in str(error)
         solution = mr.solve(model, oracle, epsilon=1e-3, rays=4000, seed=seed)
     assert abs(balance(solution) - 1) < 1e-3
     values, _, _ = leaf_values(solution)
     assert np.isfinite(values).all() and (values >= 0).all()
-    np.testing.assert_allclose(partition(solution), np.array(model.area), rtol=1e-5)
+    np.testing.assert_allclose(partition(solution), np.array(model.patches.area), rtol=1e-5)
     child, area = np.array(solution.elements.child), np.array(solution.elements.area)
     inner = np.flatnonzero(child)
     np.testing.assert_allclose(area[child[inner, None] + np.arange(4)].sum(axis=1), area[inner], rtol=1e-6)

@@ -17,7 +17,7 @@ def over(floor):
 
 def test_back_sides_only_where_light_can_reach():
     one, two = (Model(over(rectangle(bsdf=diffuse(two_sided=t)))) for t in (False, True))
-    assert one.count == two.count == 4  # the back of the floor sees nothing
+    assert one.patches.count == two.patches.count == 4  # the back of the floor sees nothing
     between = scene(
         a=rectangle(bsdf=diffuse(two_sided=True)),
         lamp=rectangle(
@@ -25,7 +25,7 @@ def test_back_sides_only_where_light_can_reach():
         ),
         below=rectangle(mi.ScalarTransform4f().translate([1, 0, -1]).scale(2), bsdf=diffuse()),
     )
-    assert Model(between).count == 8  # here it sees a floor that the lamp lights
+    assert Model(between).patches.count == 8  # here it sees a floor that the lamp lights
 
 
 def test_unlit_rooms_cost_nothing():
@@ -37,12 +37,12 @@ def test_unlit_rooms_cost_nothing():
         "to_world": mi.ScalarTransform4f().translate([5, 0, 0]),
     }
     model = Model(scene(lit=lit, dark=dark))
-    assert (model.count, model.unreached) == (12, 12)
+    assert (model.patches.count, model.unreached) == (12, 12)
 
 
 def test_patches_have_the_units_of_the_paper():
     model = Model(over(rectangle(bsdf=diffuse(0.3))))
-    emission, rho, area = (np.array(x) for x in (model.emission, model.reflectance, model.area))
+    emission, rho, area = (np.array(x) for x in (model.patches.emission, model.patches.reflectance, model.patches.area))
     assert sorted(set(np.round(emission[0], 5))) == [0, 1]
     assert area.sum() == pytest.approx(8) and rho.min() == pytest.approx(0.3)
 
@@ -59,9 +59,9 @@ def test_disks_keep_their_area():
             floor=rectangle(mi.ScalarTransform4f().translate([0, 0, -1]).scale(3), bsdf=diffuse()),
         )
     )
-    emission, area = np.array(model.emission)[0], np.array(model.area)
+    emission, area = np.array(model.patches.emission)[0], np.array(model.patches.area)
     assert area[emission > 0].sum() == pytest.approx(np.pi, rel=1e-5)
-    assert np.array(model.normal)[2][emission > 0] == pytest.approx(-1)
+    assert np.array(model.patches.normal)[2][emission > 0] == pytest.approx(-1)
 
 
 def test_normals_follow_the_shading_side():
@@ -72,8 +72,8 @@ def test_normals_follow_the_shading_side():
                 box={"type": "cube", "flip_normals": True, "to_world": to_world, "bsdf": diffuse(), "emitter": lamp()}
             )
         )
-        centroid = np.array(model.p0) + (np.array(model.e1) + np.array(model.e2)) / 3
-        assert ((np.array(model.normal) * centroid).sum(axis=0) < 0).all()
+        centroid = np.array(model.patches.p0) + (np.array(model.patches.e1) + np.array(model.patches.e2)) / 3
+        assert ((np.array(model.patches.normal) * centroid).sum(axis=0) < 0).all()
 
 
 def test_textures_give_each_element_its_own_reflectance():
@@ -89,7 +89,7 @@ def test_textures_give_each_element_its_own_reflectance():
     solution = mr.solve(over(rectangle(bsdf=checker)), mr.Uniform(), elements=1000, rays=20_000)
     rho = np.array(solution.elements.reflectance)[0]
     leaves = (np.array(solution.elements.child) == 0) & (
-        np.array(solution.model.normal)[2][np.array(solution.elements.patch)] > 0
+        np.array(solution.model.patches.normal)[2][np.array(solution.elements.patch)] > 0
     )
     assert rho[leaves].min() == pytest.approx(0.1) and rho[leaves].max() == pytest.approx(0.9)
     assert rho[leaves].mean() == pytest.approx(0.5, abs=0.05)
@@ -103,7 +103,7 @@ def test_fingerprint_ignores_the_order_of_shapes():
     up = rectangle(mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(), emitter=lamp())
     a, b = Model(scene(a=floor, b=small, c=up)), Model(scene(a=up, b=floor, c=small))
     assert a.fingerprint == b.fingerprint
-    np.testing.assert_array_equal(np.array(a.p0), np.array(b.p0))
+    np.testing.assert_array_equal(np.array(a.patches.p0), np.array(b.patches.p0))
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def test_white_furnace_everywhere():
 
 def test_leaves_partition_their_patches(cornell):
     solution = mr.solve(cornell, elements=3000, rays=50_000)
-    np.testing.assert_allclose(partition(solution), np.array(solution.model.area), rtol=1e-5)
+    np.testing.assert_allclose(partition(solution), np.array(solution.model.patches.area), rtol=1e-5)
     child, area = np.array(solution.elements.child), np.array(solution.elements.area)
     parents = np.flatnonzero(child)
     np.testing.assert_allclose(sum(area[child[parents] + k] for k in range(4)), area[parents], rtol=1e-6)
@@ -61,10 +61,10 @@ def test_direct_and_indirect_are_apart():
     )
     solution = mr.solve(plates, elements=200, rays=400_000)
     direct, indirect = np.array(solution.direct)[0], np.array(solution.indirect)[0]
-    emits = np.array(dr.max(solution.model.emission) > 0)[np.array(solution.elements.patch)]
+    emits = np.array(dr.max(solution.model.patches.emission) > 0)[np.array(solution.elements.patch)]
     assert (direct[emits] == 0).all() and (direct[~emits] > 0).all()
     area = np.array(solution.elements.area)
-    roots = np.arange(solution.model.count)
+    roots = np.arange(solution.model.patches.count)
     mean = np.average(direct[roots][~emits[roots]], weights=area[roots][~emits[roots]])
     # Parallel squares of side 2 at distance 1 (C-11 with X = Y = 2).
     assert mean == pytest.approx(0.41525323, rel=5e-3)
@@ -81,8 +81,8 @@ def test_what_lies_inside_solids_is_left_out():
     )
     solution = mr.solve(room, elements=1000, rays=200_000)
     leaves = np.array(solution.elements.child) == 0
-    patch, open_area = (np.array(x)[leaves] for x in (solution.elements.patch, solution.elements.open_area))
-    height, up = np.array(solution.model.corner(0))[2], np.array(solution.model.normal)[2]
+    patch, open_area = (np.array(x)[leaves] for x in (solution.elements.patch, solution.exposure.open_area))
+    height, up = np.array(solution.model.patches.corners[0])[2], np.array(solution.model.patches.normal)[2]
     floor = (height == 0) & (up > 0)
     assert open_area[floor[patch]].sum() == pytest.approx(3, rel=0.01)
     power = solution.stats["power"]
@@ -123,10 +123,10 @@ def test_kernels_do_not_grow_with_the_work(cornell):
     "options, says",
     [
         (dict(elements=10), "patches"),
-        (dict(elements=0), "--elements"),
-        (dict(rays=-5), "--rays"),
-        (dict(lines=0), "--lines"),
-        (dict(epsilon=0.0), "--epsilon"),
+        (dict(elements=0), "elements"),
+        (dict(rays=-5), "rays"),
+        (dict(lines=0), "lines"),
+        (dict(epsilon=0.0), "epsilon"),
         (dict(elements=100, epsilon=1.0), "not both"),
         (dict(oracle="gmi"), "instance"),
     ],

@@ -1,9 +1,31 @@
-"""Small array tools: searching, and sums that come out the same on any number of threads."""
+"""Small array tools: searching, drawing, and sums that come out the same on any number of threads."""
 
 import math
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
+
+NONE = 0xFFFFFFFF  # "no patch", "no element", "no pair"
+WEIGHTS = 2.0**46  # resolution of a Distribution
+
+
+def owned(kind, array):
+    """A Dr.Jit array (mi.Float or mi.UInt32) with a copy of a NumPy array of one dimension.
+
+    Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
+    """
+    kept = np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32)
+    copy = dr.empty(kind, len(kept))
+    if len(kept):
+        dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))
+        dr.eval(copy)
+    return copy
+
+
+def owned_vectors(kind, array):
+    """A Dr.Jit array of three-vectors (mi.Point3f, mi.Vector3f, mi.Color3f) from NumPy [n, 3]."""
+    return kind(*(owned(mi.Float, column) for column in np.asarray(array).T))
 
 
 def opaque_index(value):
@@ -92,3 +114,41 @@ def totals(arrays):
 def power_of_two(value):
     """The smallest power of two ≥ ``value`` (1 for 0): scales by it round nothing."""
     return 2.0 ** (math.frexp(value)[1] if value > 0 else 0)
+
+
+class Distribution:
+    """Draws numbers 0…n−1 in proportion to weights (Float64 [n], ≥ 0, some > 0).
+
+    In integers, so that it is the same on any number of threads. ``whole`` is their sum (Python int).
+    """
+
+    def __init__(self, weights, total):
+        scale = dr.opaque(mi.Float64, WEIGHTS / power_of_two(total))
+        self.weight = mi.UInt64(dr.ceil(weights * scale))
+        self.cumulative = dr.cumsum(self.weight)
+        dr.eval(self.cumulative, self.weight)
+        self.whole = dr.gather(mi.UInt64, self.cumulative, dr.width(self.cumulative) - 1)[0]
+
+    def at(self, position):
+        """The number whose weight covers a position in [0, whole) (Float64 [m] ─► UInt32 [m])."""
+        return lower_bound(self.cumulative, mi.UInt64(position) + 1)
+
+    def start(self, number):
+        """Where the weight of a number begins (Float64 [m])."""
+        end, weight = dr.gather(mi.UInt64, self.cumulative, number), dr.gather(mi.UInt64, self.weight, number)
+        return mi.Float64(end - weight)
+
+    def probability(self, number):
+        """p(number) (Float64 [m])."""
+        return mi.Float64(dr.gather(mi.UInt64, self.weight, number)) / dr.opaque(mi.Float64, self.whole)
+
+
+def components(count, a, b):
+    """Labels of ``count`` things, the same for those that links a[k], b[k] connect (int [count])."""
+    label, before = np.arange(count), None
+    while before is None or (label != before).any():
+        before = label.copy()
+        np.minimum.at(label, a, label[b])
+        np.minimum.at(label, b, label[a])
+        label = label[label]
+    return label

@@ -1,4 +1,4 @@
-"""Counter-based low-discrepancy points.
+"""Counter-based low-discrepancy points, and the streams they are drawn from.
 
 A four-dimensional Kronecker sequence (Roberts' R₄: point n is frac(s + n·(φ⁻¹, φ⁻², φ⁻³, φ⁻⁴)), φ⁵ = φ + 1)
 has what both of its users need: any run of consecutive points is again well spread, so the rays of
@@ -7,12 +7,35 @@ The shift s is a hash of a key, which makes the estimates unbiased over seeds an
 between keys, threads and array sizes.
 """
 
+from enum import IntEnum
+
 import drjit as dr
 import mitsuba as mi
 
 _PHI = 1.1673039782614187
 ROUNDS = 8  # of the hash: with Mitsuba's 4, the numbers of neighbouring keys and seeds go together
 STEPS = tuple(round(_PHI ** -(d + 1) * 2**32) for d in range(4))
+
+
+class Stream(IntEnum):
+    """Who draws: no two of them see the same numbers. The order is part of what a seed means."""
+
+    POWER = 0  # rays that carry the power of the solution
+    PAIRS = 1  # lines between the elements of a pair
+    PILOT = 2  # rays that discover pairs; one stream each
+    COVER = 3  # points that show what of a leaf is covered
+    STARVED = 4  # lines and rays of leaves that gather
+    LAMPS = 5  # the choice of a lamp
+    REACH = 6  # rays that look for light while a scene is read
+    MEASURE = 7  # irradiance at points of the user's
+
+
+def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:
+    """The 32-bit seed of a stream: a mix of the user's seed, of who draws, and of a number of his (Python int)."""
+    mixed = (seed & 0xFFFFFFFF) ^ (0x9E3779B97F4A7C15 * (1 + stream + 64 * number) & 0xFFFFFFFFFFFFFFFF)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # SplitMix64's finaliser
+        mixed = ((mixed ^ (mixed >> shift)) * factor) & 0xFFFFFFFFFFFFFFFF
+    return (mixed ^ (mixed >> 31)) & 0xFFFFFFFF
 
 
 def kronecker(index, key, seed, owner=None):
@@ -32,6 +55,11 @@ def kronecker(index, key, seed, owner=None):
 def hash_pair(a, b):
     """One well mixed number from two (UInt32 [n])."""
     return mi.sample_tea_32(a, b, ROUNDS)[0]
+
+
+def uniform(key, seed):
+    """One uniform number in [0, 1) per key (Float [n])."""
+    return mi.sample_tea_float32(key, seed, ROUNDS)
 
 
 def triangle(u, v):

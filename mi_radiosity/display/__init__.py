@@ -1,7 +1,8 @@
-"""Radiosity shown: a continuous field over the mesh, and the `radiosity` integrator."""
+"""Radiosity shown: shadings by name, a continuous field over the mesh, and the `radiosity` integrator."""
 
 from .field import Field
 from .image import write_image
-from .integrator import SHADINGS, register, render
+from .integrator import register, render
+from .shaders import SHADERS, Look, Shader
 
-__all__ = ["Field", "SHADINGS", "register", "render", "write_image"]
+__all__ = ["SHADERS", "Field", "Look", "Shader", "register", "render", "write_image"]

@@ -1,21 +1,16 @@
-"""The element tree: patches split 1→4 into triangles."""
+"""Elements: triangles that patches are split into, 1→4."""
+
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.points import hash_pair
 from ..core.arrays import concat, opaque_index
+from ..core.points import hash_pair
+from .subdivision import child_at, child_frame
 
-NODES = (
-    (0.0, 0.0),
-    (1.0, 0.0),
-    (0.0, 1.0),
-    (0.5, 0.5),
-    (0.0, 0.5),
-    (0.5, 0.0),
-)  # of an element: corners, and middles opposite them
-TUCK = 2.0**-14  # how far inside of its element a node is when something is looked for between it and others
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
+ARRAYS = ("patch", "parent", "child", "place", "u0", "v0", "scale", "area", "reflectance")
 
 
 class Elements:
@@ -26,84 +21,56 @@ class Elements:
 
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
-    way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale`` (Float), ``area``
-    and ``open_area`` (Float, m²; the second without what is covered, see `find_covered`),
-    ``reflectance`` (Color3f, the mean over the element), ``divided`` (Bool) and ``across``
-    (UInt32, a bit for each of the NODES of a leaf that a wall keeps from its light, see `find_divided`).
+    way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale``, ``area`` (Float, m²) and
+    ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
     """
 
-    def __init__(self, model):
-        n = model.count
-        self.model = model
-        self.patch = dr.arange(mi.UInt32, n)
-        self.parent = dr.arange(mi.UInt32, n)
-        self.child = dr.zeros(mi.UInt32, n)
-        self.place = dr.zeros(mi.UInt32, n)
-        self.u0, self.v0 = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
-        self.scale = dr.full(mi.Float, 1, n)
-        self.area = self.open_area = mi.Float(model.area)
-        self.reflectance = mi.Color3f(model.reflectance)
-        self.divided, self.across = dr.zeros(mi.Bool, n), dr.zeros(mi.UInt32, n)
-        self.leaves = n
+    def __init__(self, patches, arrays):
+        self.patches = patches
+        for name in ARRAYS:
+            setattr(self, name, arrays[name])
 
     def __len__(self):
         return dr.width(self.patch)
 
-    def leaf_indices(self):
+    def __setattr__(self, name, value):
+        if "_frozen" in vars(self):
+            raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
+        super().__setattr__(name, value)
+
+    @cached_property
+    def leaves(self):
         """Numbers of the leaves (UInt32 [leaves]), neighbours after neighbours, whichever was split first."""
         leaves = dr.compress(self.child == 0)
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
 
+    def level(self, element):
+        """How often the patch was split (UInt32 [n])."""
+        return dr.gather(mi.UInt32, self.place, element) & 15
+
     def key(self, element):
         """What random numbers of elements are drawn by: the same whatever else was split (UInt32 [n])."""
         return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
-    def split(self, chosen):
-        """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
-        count = dr.width(chosen)
-        if count == 0:
-            return
-        first = opaque_index(len(self)) + 4 * dr.arange(mi.UInt32, count)
-        dr.scatter(self.child, first, chosen)
-        k = dr.arange(mi.UInt32, 4 * count)
-        parent, which = dr.gather(mi.UInt32, chosen, k // 4), k % 4
-        patch = dr.gather(mi.UInt32, self.patch, parent)
-        half = dr.gather(mi.Float, self.scale, parent) * 0.5
-        u0 = dr.gather(mi.Float, self.u0, parent) + dr.select((which == 1) | (which == 3), half, 0)
-        v0 = dr.gather(mi.Float, self.v0, parent) + dr.select(which >= 2, half, 0)
-        scale = dr.select(which == 3, -half, half)
-        reflectance = dr.gather(mi.Color3f, self.reflectance, parent)
-        if self.model.textured:
-            reflectance = self._mean_reflectance(patch, u0, v0, scale)
-        self.patch = concat(self.patch, patch)
-        self.parent = concat(self.parent, parent)
-        self.child = concat(self.child, dr.zeros(mi.UInt32, 4 * count))
-        place = dr.gather(mi.UInt32, self.place, parent)
-        self.place = concat(self.place, place + 1 + (which << (2 + 2 * (MAX_LEVEL - (place & 15)))))
-        self.u0, self.v0 = concat(self.u0, u0), concat(self.v0, v0)
-        self.scale = concat(self.scale, scale)
-        self.area = self.open_area = concat(self.area, dr.gather(mi.Float, self.area, parent) * 0.25)
-        self.reflectance = concat(self.reflectance, reflectance)
-        self.leaves += 3 * count
-        dr.eval(
-            self.patch, self.parent, self.child, self.place, self.u0, self.v0, self.scale, self.area, self.reflectance
-        )
+    def emission(self, element):
+        """E (Color3f [n])."""
+        return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
-    def _mean_reflectance(self, patch, u0, v0, scale):
-        """ρ averaged over four points of each element (Color3f)."""
-        face, back = dr.gather(mi.UInt32, self.model.face, patch), dr.gather(mi.Bool, self.model.back, patch)
-        total = mi.Color3f(0)
-        for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
-            total += self.model.faces.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
-        return total / 4
+    def patch_point(self, element, a, b):
+        """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
+        scale = dr.gather(mi.Float, self.scale, element)
+        return dr.gather(mi.Float, self.u0, element) + scale * a, dr.gather(mi.Float, self.v0, element) + scale * b
+
+    def own_point(self, element, u, v, active=True):
+        """The element's own coordinates (a, b) of the patch point (u, v)."""
+        scale = dr.select(active, dr.gather(mi.Float, self.scale, element, active), 1)
+        a = (u - dr.gather(mi.Float, self.u0, element, active)) / scale
+        return a, (v - dr.gather(mi.Float, self.v0, element, active)) / scale
 
     def locate(self, element, u, v):
         """Child number 0…3 of ``element`` that holds the patch point (u, v) (UInt32 [n])."""
-        scale = dr.gather(mi.Float, self.scale, element)
-        a = (u - dr.gather(mi.Float, self.u0, element)) / scale
-        b = (v - dr.gather(mi.Float, self.v0, element)) / scale
-        return child_at(a, b)
+        return child_at(*self.own_point(element, u, v))
 
     @dr.syntax
     def leaf_at(self, element, u, v, active=True):
@@ -115,46 +82,68 @@ class Elements:
             child = dr.gather(mi.UInt32, self.child, element)
         return element
 
-    @dr.syntax
-    def add_to_ancestors(self, sums, leaves, power):
-        """Add values of leaves (three Float64) to themselves and to all their ancestors in ColorSums."""
-        element = mi.UInt32(leaves)
-        climbing = dr.full(mi.Bool, True, dr.width(leaves))
-        while climbing:
-            sums.add(power, element, climbing)
-            parent = dr.gather(mi.UInt32, self.parent, element)
-            climbing = parent != element
-            element = parent
 
-    @dr.syntax
-    def mark_ancestors(self, marks, elements):
-        """Set ``marks`` (Bool [elements]) of elements and of all their ancestors."""
-        element = mi.UInt32(elements)
-        climbing = dr.full(mi.Bool, True, dr.width(elements))
-        while climbing:
-            dr.scatter(marks, True, element, climbing)
-            parent = dr.gather(mi.UInt32, self.parent, element)
-            climbing = parent != element
-            element = parent
+class Tree(Elements):
+    """Elements that still split. ``leaf_count`` is the number of leaves."""
 
-    def node_point(self, element, a, b):
-        """Patch coordinates (u, v) of a node (a, b) of elements: just off the walls that stand along their sides."""
-        return self.patch_point(element, *((1 - TUCK) * x + TUCK / 3 for x in (a, b)))
+    def __init__(self, patches, materials):
+        n = patches.count
+        every = dr.arange(mi.UInt32, n)
+        zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
+        arrays = (every, every, zero, zero, nought, nought, dr.full(mi.Float, 1, n), patches.area, patches.reflectance)
+        super().__init__(patches, {name: type(array)(array) for name, array in zip(ARRAYS, arrays)})
+        self._materials, self.leaf_count = materials, n
 
-    def in_sight(self, element, u, v, a, b, active=True):
-        """Is nothing between patch points (u, v) of elements and their nodes (a, b) (Bool [n])?"""
-        return ~self.model.walled(
-            dr.gather(mi.UInt32, self.patch, element, active), u, v, *self.node_point(element, a, b), active
-        )
+    @property
+    def leaves(self):
+        raise AttributeError("a tree still grows: freeze it first")
 
-    def patch_point(self, element, a, b):
-        """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
-        scale = dr.gather(mi.Float, self.scale, element)
-        return dr.gather(mi.Float, self.u0, element) + scale * a, dr.gather(mi.Float, self.v0, element) + scale * b
+    def freeze(self) -> Elements:
+        """The elements as they are now; what the tree does later leaves them alone."""
+        elements = Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
+        elements._frozen = True
+        return elements
 
+    def _arrays(self):
+        return {name: getattr(self, name) for name in ARRAYS}
 
-def child_at(a, b):
-    """Which child holds a point (a, b) of an element; 3 is the middle one."""
-    return dr.select(
-        a >= 0.5, mi.UInt32(1), dr.select(b >= 0.5, mi.UInt32(2), dr.select(a + b <= 0.5, mi.UInt32(0), mi.UInt32(3)))
-    )
+    def split(self, chosen):
+        """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
+        count = dr.width(chosen)
+        if count == 0:
+            return
+        first = opaque_index(len(self)) + 4 * dr.arange(mi.UInt32, count)
+        dr.scatter(self.child, first, chosen)
+        k = dr.arange(mi.UInt32, 4 * count)
+        new = self._children(dr.gather(mi.UInt32, chosen, k // 4), k % 4)
+        for name in ARRAYS:
+            setattr(self, name, concat(getattr(self, name), new[name]))
+        self.leaf_count += 3 * count
+        dr.eval(*self._arrays().values())
+
+    def _children(self, parent, which):
+        """Arrays of the children ``which`` of elements."""
+        patch, place = dr.gather(mi.UInt32, self.patch, parent), dr.gather(mi.UInt32, self.place, parent)
+        frame = child_frame(which, *(dr.gather(mi.Float, x, parent) for x in (self.u0, self.v0, self.scale)))
+        reflectance = dr.gather(mi.Color3f, self.reflectance, parent)
+        if self._materials.textured:
+            reflectance = self._mean_reflectance(patch, *frame)
+        return {
+            "patch": patch,
+            "parent": parent,
+            "child": dr.zeros(mi.UInt32, dr.width(parent)),
+            "place": place + 1 + (which << (2 + 2 * (MAX_LEVEL - (place & 15)))),
+            "u0": frame[0],
+            "v0": frame[1],
+            "scale": frame[2],
+            "area": dr.gather(mi.Float, self.area, parent) * 0.25,
+            "reflectance": reflectance,
+        }
+
+    def _mean_reflectance(self, patch, u0, v0, scale):
+        """ρ averaged over four points of each element (Color3f)."""
+        face, back = dr.gather(mi.UInt32, self.patches.face, patch), dr.gather(mi.Bool, self.patches.back, patch)
+        total = mi.Color3f(0)
+        for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
+            total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
+        return total / 4

@@ -1,60 +1,78 @@
 """The pair tree: which elements exchange power, and what the oracle said of them."""
 
+import dataclasses
+
 import drjit as dr
 import mitsuba as mi
 
+from ..core.arrays import NONE, concat, lower_bound, lower_bound_within, opaque_index, unique
+from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
 from ..oracles import KernelSamples, Pair
-from ..scene.model import NONE
-from ..core.points import hash_pair, kronecker, triangle
-from ..core.arrays import concat, lower_bound, lower_bound_within, opaque_index, unique
 from .elements import MAX_LEVEL
 
-UNKNOWN = -1.0  # σ of a pair nobody has evaluated
 BATCH = 1 << 18  # pairs sampled in one launch: bounds memory
+ARRAYS = ("receiver", "source", "child", "halved", "asked", "occluded")
 
 
 class Pairs:
     """Pairs (receiver i, source j) of elements, born of rays.
 
     Roots are pairs of patches that a ray connects, found by binary search in the row of i of sorted keys i·2³² + j.
-    A pair whose larger element is split has four children. Arrays over pairs: ``receiver``,
-    ``source``, ``child`` (first of four, 0 for none), ``halved`` (2 · the element that was split, + 1 if
-    it is the receiver; UInt32), ``sigma`` (Float, UNKNOWN before the
-    one evaluation a pair ever gets), ``partial`` (Bool: a line between the two was blocked, or below
-    a horizon, so that light does not spread over all of the receiver).
+    A pair whose larger element is split has four children. Arrays over pairs: ``receiver``, ``source``, ``child``
+    (first of four, 0 for none), ``halved`` (2 · the element that was split, + 1 if it is the receiver; UInt32),
+    ``asked`` (Bool: the oracle has evaluated it, which happens once), ``occluded`` (Bool: a line between the two was
+    blocked, or below a horizon, so that light does not spread over all of the receiver) and ``sigma``, what the
+    oracle said (a list of Float, one for each of its numbers).
+
+    ``evaluated`` counts the pairs the oracle has seen.
     """
 
-    def __init__(self, elements, oracle, lines, seed):
-        self.elements, self.oracle, self.lines = elements, oracle, lines
-        self.seed = dr.opaque(mi.UInt32, seed)
-        self.root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)  # a sentinel, so that the table is never empty
-        self.roots = mi.UInt32(NONE)
+    def __init__(self, elements, rays, oracle, lines, seed):
+        self.elements, self.rays, self.oracle, self.lines = elements, rays, oracle, lines
+        self._seed = opaque_index(stream_seed(seed, Stream.PAIRS))
+        self._root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)  # a sentinel, so that the table is never empty
+        self._roots = mi.UInt32(NONE)
         self._index_rows()
         # Pair 0 is never used, so that child == 0 means none.
         self.receiver, self.source, self.child, self.halved = (mi.UInt32(0) for _ in range(4))
-        self.sigma, self.partial = mi.Float(0), mi.Bool(False)
+        self.asked, self.occluded = mi.Bool(True), mi.Bool(False)
+        self.sigma: list = []
         self.evaluated = 0
 
     def __len__(self):
         return dr.width(self.receiver)
 
+    def freeze(self, elements) -> "Pairs":
+        """The pairs as they are now, between frozen elements."""
+        frozen = object.__new__(Pairs)
+        frozen.__dict__.update(self.__dict__)
+        frozen.elements = elements
+        for name in ARRAYS:
+            value = getattr(self, name)
+            setattr(frozen, name, type(value)(value))
+        return frozen
+
     def _append(self, receiver, source):
-        self.receiver = concat(self.receiver, receiver)
-        self.source = concat(self.source, source)
         n = dr.width(receiver)
+        self.receiver, self.source = concat(self.receiver, receiver), concat(self.source, source)
         self.child = concat(self.child, dr.zeros(mi.UInt32, n))
         self.halved = concat(self.halved, dr.zeros(mi.UInt32, n))
-        self.sigma = concat(self.sigma, dr.full(mi.Float, UNKNOWN, n))
-        self.partial = concat(self.partial, dr.zeros(mi.Bool, n))
+        self.asked = concat(self.asked, dr.zeros(mi.Bool, n))
+        self.occluded = concat(self.occluded, dr.zeros(mi.Bool, n))
+        self.sigma = [concat(s, dr.zeros(mi.Float, n)) for s in self.sigma]
+        self._eval()
+
+    def _eval(self):
+        dr.eval(*(getattr(self, name) for name in ARRAYS), self.sigma)
 
     # ---- Finding pairs -------------------------------------------------------------------------
 
-    def find_roots(self, i, j, active):
+    def find_roots(self, i, j, active=True):
         """Numbers of the root pairs of patches (i, j), NONE where there is none yet (UInt32 [n])."""
         first, last = dr.gather(mi.UInt32, self._row, i, active), dr.gather(mi.UInt32, self._row, i + 1, active)
         at = lower_bound_within(self._sources, j, first, last, active)
         found = active & (at < last) & (dr.gather(mi.UInt32, self._sources, at, active) == j)
-        return dr.select(found, dr.gather(mi.UInt32, self.roots, at, found), NONE)
+        return dr.select(found, dr.gather(mi.UInt32, self._roots, at, found), NONE)
 
     def add_roots(self, i, j):
         """Make root pairs of patches (i, j) that have none (UInt32 [n], repetitions allowed)."""
@@ -63,28 +81,29 @@ class Pairs:
         keys = unique((mi.UInt64(i) << 32) | mi.UInt64(j))
         fresh = opaque_index(len(self)) + dr.arange(mi.UInt32, dr.width(keys))
         self._append(mi.UInt32(keys >> 32), mi.UInt32(keys))
-        keys, roots = concat(self.root_keys, keys), concat(self.roots, fresh)
+        keys, roots = concat(self._root_keys, keys), concat(self._roots, fresh)
         order = dr.argsort(keys)
-        self.root_keys, self.roots = dr.gather(mi.UInt64, keys, order), dr.gather(mi.UInt32, roots, order)
-        dr.eval(self.root_keys, self.roots)
+        self._root_keys, self._roots = dr.gather(mi.UInt64, keys, order), dr.gather(mi.UInt32, roots, order)
+        dr.eval(self._root_keys, self._roots)
         self._index_rows()
 
     def _index_rows(self):
         """Note where the keys of each receiving patch begin, which makes searches short."""
-        self._sources = mi.UInt32(self.root_keys)
-        self._row = lower_bound(self.root_keys, mi.UInt64(dr.arange(mi.UInt32, self.elements.model.count + 1)) << 32)
+        self._sources = mi.UInt32(self._root_keys)
+        rows = dr.arange(mi.UInt32, self.elements.patches.count + 1)
+        self._row = lower_bound(self._root_keys, mi.UInt64(rows) << 32)
         dr.eval(self._sources, self._row)
 
     @dr.syntax
     def descend(self, pair, ui, vi, uj, vj, active=True):
         """Follow points (ui, vi) of receivers and (uj, vj) of sources down to pairs without children."""
         pair = mi.UInt32(pair)
-        e = self.elements
         child = dr.gather(mi.UInt32, self.child, pair, active)
         while child != 0:
             split = dr.gather(mi.UInt32, self.halved, pair)
             of_receiver = (split & 1) == 1
-            pair = child + e.locate(split >> 1, dr.select(of_receiver, ui, uj), dr.select(of_receiver, vi, vj))
+            u, v = dr.select(of_receiver, ui, uj), dr.select(of_receiver, vi, vj)
+            pair = child + self.elements.locate(split >> 1, u, v)
             child = dr.gather(mi.UInt32, self.child, pair)
         return pair
 
@@ -94,33 +113,25 @@ class Pairs:
         """Ask the oracle for σ of ``pairs`` (UInt32 [n], none evaluated before)."""
         n = dr.width(pairs)
         for start in range(0, n, BATCH):
-            batch = (
-                dr.gather(mi.UInt32, pairs, opaque_index(start) + dr.arange(mi.UInt32, min(BATCH, n - start)))
-                if n > BATCH
-                else pairs
-            )
-            self._evaluate(batch)
+            index = opaque_index(start) + dr.arange(mi.UInt32, min(BATCH, n - start))
+            self._evaluate(dr.gather(mi.UInt32, pairs, index) if n > BATCH else pairs)
         self.evaluated += n
 
     def _evaluate(self, pairs):
-        e = self.elements
         samples = None
         if self.oracle.uses_lines:
             values = self.kernel_samples(pairs)
             dr.eval(values)
             samples = KernelSamples(values, self.lines)
-            dr.scatter(self.partial, samples.min() <= 0, pairs)
-        receiver, source = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        pair = Pair(
-            mi.Float64(dr.gather(mi.Float, e.area, receiver)),
-            mi.Float64(dr.gather(mi.Float, e.area, source)),
-            e.model.total_area,
-            dr.gather(mi.UInt32, e.place, receiver) & 15,
-            dr.gather(mi.UInt32, e.place, source) & 15,
-        )
-        sigma = self.oracle.sigma(samples, pair)
-        dr.scatter(self.sigma, dr.maximum(mi.Float(sigma), 0), pairs)
-        dr.eval(self.sigma, self.partial)
+            dr.scatter(self.occluded, samples.min() <= 0, pairs)
+        sigma = self.oracle.sigma(samples, self.describe(pairs))
+        numbers = sigma if isinstance(sigma, tuple) else (sigma,)
+        if not self.sigma:
+            self.sigma = [dr.zeros(mi.Float, len(self)) for _ in numbers]
+        for kept, number in zip(self.sigma, numbers):
+            dr.scatter(kept, mi.Float(number), pairs)
+        dr.scatter(self.asked, True, pairs)
+        dr.eval(self.sigma, self.occluded, self.asked)
 
     def kernel_samples(self, pairs):
         """F along S lines of each pair, stratified in all four dimensions (Float [pairs · lines])."""
@@ -128,13 +139,27 @@ class Pairs:
         k = dr.arange(mi.UInt32, dr.width(pairs) * self.lines)
         of = k // lines
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        key = hash_pair(e.key(i), e.key(j))
-        x0, x1, y0, y1 = kronecker(k % lines, key, self.seed, of)
-        pair = dr.gather(mi.UInt32, pairs, of)
-        i, j = dr.gather(mi.UInt32, self.receiver, pair), dr.gather(mi.UInt32, self.source, pair)
-        ui, vi = e.patch_point(i, *triangle(x0, x1))
-        uj, vj = e.patch_point(j, *triangle(y0, y1))
-        return e.model.kernel(dr.gather(mi.UInt32, e.patch, i), ui, vi, dr.gather(mi.UInt32, e.patch, j), uj, vj)
+        x0, x1, y0, y1 = kronecker(k % lines, hash_pair(e.key(i), e.key(j)), self._seed, of)
+        i, j = dr.gather(mi.UInt32, i, of), dr.gather(mi.UInt32, j, of)
+        x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
+        return self.rays.kernel(dr.gather(mi.UInt32, e.patch, i), *x, dr.gather(mi.UInt32, e.patch, j), *y)
+
+    def describe(self, pairs, radiosity=None) -> Pair:
+        """Pairs as the oracle sees them; with ``radiosity`` B (Color3f [elements]) as its rule of acceptance does."""
+        e = self.elements
+        i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
+        areas = [mi.Float64(dr.gather(mi.Float, e.area, k)) for k in (i, j)]
+        pair = Pair(*areas, e.patches.total_area, e.level(i), e.level(j))
+        if radiosity is None:
+            return pair
+        rho, B = dr.gather(mi.Color3f, e.reflectance, i), dr.gather(mi.Color3f, radiosity, j)
+        return dataclasses.replace(pair, rho=rho, B=B)
+
+    def value(self, pairs, radiosity):
+        """What the oracle compares with ε, for pairs it has evaluated (Float [n], ≥ 0)."""
+        sigma = [dr.gather(mi.Float, s, pairs) for s in self.sigma]
+        value = self.oracle.value(sigma[0] if len(sigma) == 1 else tuple(sigma), self.describe(pairs, radiosity))
+        return dr.maximum(mi.Float(value), 0)
 
     # ---- Splitting -----------------------------------------------------------------------------
 
@@ -142,8 +167,7 @@ class Pairs:
         """The element that splits when a pair is rejected: the larger of two (UInt32 [n], NONE if it cannot)."""
         e = self.elements
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        finest = 2.0**-MAX_LEVEL
-        free_i, free_j = (dr.abs(dr.gather(mi.Float, e.scale, k)) > finest for k in (i, j))
+        free_i, free_j = (e.level(k) < MAX_LEVEL for k in (i, j))
         larger_i = dr.gather(mi.Float, e.area, i) >= dr.gather(mi.Float, e.area, j)
         return dr.select(free_i & (larger_i | ~free_j), i, dr.select(free_j, j, NONE))
 
@@ -152,17 +176,12 @@ class Pairs:
         count = dr.width(chosen)
         if count == 0:
             return
-        first = opaque_index(len(self)) + 4 * dr.arange(mi.UInt32, count)
-        dr.scatter(self.child, first, chosen)
+        of_receiver = element == dr.gather(mi.UInt32, self.receiver, chosen)
+        dr.scatter(self.child, opaque_index(len(self)) + 4 * dr.arange(mi.UInt32, count), chosen)
+        dr.scatter(self.halved, 2 * element + dr.select(of_receiver, mi.UInt32(1), 0), chosen)
         k = dr.arange(mi.UInt32, 4 * count)
         parent, split = dr.gather(mi.UInt32, chosen, k // 4), dr.gather(mi.UInt32, element, k // 4)
         half = dr.gather(mi.UInt32, self.elements.child, split) + k % 4
         receiver, source = dr.gather(mi.UInt32, self.receiver, parent), dr.gather(mi.UInt32, self.source, parent)
         of_receiver = receiver == split
-        dr.scatter(
-            self.halved,
-            2 * element + dr.select(element == dr.gather(mi.UInt32, self.receiver, chosen), mi.UInt32(1), 0),
-            chosen,
-        )
         self._append(dr.select(of_receiver, half, receiver), dr.select(of_receiver, source, half))
-        dr.eval(self.receiver, self.source, self.child, self.halved, self.sigma, self.partial)

@@ -23,8 +23,8 @@ class Pair:
     area_receiver: "mi.Float64"  # A_i, m² [pairs]
     area_source: "mi.Float64"  # A_j, m² [pairs]
     total_area: float  # A_T of all patches, m²
-    level_receiver: "mi.UInt32"  # how often i and j were split from their patches [pairs]
-    level_source: "mi.UInt32"
+    level_receiver: "mi.UInt32 | None" = None  # how often i and j were split from their patches [pairs]
+    level_source: "mi.UInt32 | None" = None
     rho: "mi.Color3f | None" = None  # ρ_i [pairs]
     B: "mi.Color3f | None" = None  # B_j known so far, emission included, W/m² [pairs]
 

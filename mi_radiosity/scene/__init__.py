@@ -1,6 +1,9 @@
-"""A Mitsuba scene seen as oriented patches, and rays between them."""
+"""What a Mitsuba scene says: faces, materials, lamps, the oriented patches made of them, and rays between those."""
 
+from .lights import LIGHTS, Light
+from .materials import Finding, inspect
 from .model import Model
-from .support import Finding, inspect
+from .state import refuse_gradients
+from .tessellate import MESHERS, build_mesh, mesher
 
-__all__ = ["Model", "Finding", "inspect"]
+__all__ = ["LIGHTS", "MESHERS", "Finding", "Light", "Model", "build_mesh", "inspect", "mesher", "refuse_gradients"]

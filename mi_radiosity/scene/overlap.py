@@ -1,139 +1,75 @@
 """Faces that lie in one another: which of them a ray meets is decided here, not by rounding."""
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from ..core.arrays import components, owned, owned_vectors
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
 LATTICE = 8  # points along a side that show whether a face is covered
 
 
+@dataclass(frozen=True)
 class Overlaps:
     """Coplanar faces that share area, and who owns what they share.
 
-    Where faces lie in one plane to within ``tolerance``, rounding decides which of them a ray
+    Where faces lie in one plane to within rounding, rounding decides which of them a ray
     meets, so each would get a part of the light and pictures would be speckled. A point belongs to
     one side instead: to one with a material before one without, to a lamp, then to the smaller
     surface, which is read as lying on the larger. Surfaces are faces that share edges in a plane.
 
-    corners [faces, 3, 3], unit normals towards the front [faces, 3], areas [faces]; per side, front
-    and back, ``present`` (bool [faces, 2]) and ``exitance`` [faces, 2], ``reflectance`` [faces, 2].
-    Numbers of sides are 2 · face + (1 for the back).
-
-    ``covered`` (bool [faces, 2]): sides no point of which is their own.
+    Numbers of sides are 2 · face + (1 for the back). Row k says that ``over``[k] lies on ``under``[k]; rows are
+    sorted by ``under``, the uppermost first. ``covered`` (bool [faces, 2]): sides no point of which is their own.
     """
 
-    def __init__(self, corners, normal, area, sound, rank, present, exitance, reflectance, tolerance):
-        self.corners, self.tolerance = corners, tolerance
-        self.covered, self._present = np.zeros(present.shape, dtype=bool), present.ravel().copy()
-        f, g = self._pairs(normal, area, sound)
-        self._side = self._other = np.zeros(0, dtype=np.int64)
-        if not len(f):
-            return
-        surface, order = _surfaces(corners, normal), np.empty(present.size, dtype=np.int64)
-        size = np.bincount(surface, weights=np.where(sound, area, 0))[surface]
-        first = np.full(surface.max() + 1, len(area))
-        np.minimum.at(first, surface, rank)
-        keys = (
-            rank[:, None],
-            first[surface][:, None],
-            reflectance,
-            np.round(np.log(size + 1e-300), 4)[:, None],
-            -exitance,
-            ~present,
-        )
-        order[np.lexsort([np.broadcast_to(k, present.shape).ravel() for k in keys])] = np.arange(present.size)
+    corners: np.ndarray  # [faces, 3, 3]
+    present: np.ndarray  # bool [2 · faces]: sides that have a material
+    under: np.ndarray
+    over: np.ndarray
+    covered: np.ndarray
 
-        # ---- For every side, the sides before it, best first ----
-        opposite = (normal[f] * normal[g]).sum(axis=1) < 0
-        side, other = (np.concatenate([2 * f, 2 * f + 1]), np.concatenate([2 * g + opposite, 2 * g + 1 - opposite]))
-        before = (order[other] < order[side]) & present.ravel()[other]
-        by = np.lexsort([order[other[before]], side[before]])
-        self._side, self._other = side[before][by], other[before][by]
-        self._find_covered()
-
-    def __bool__(self):
-        return bool(len(self._side))
-
-    def _pairs(self, normal, area, sound):
-        """Ordered pairs (f, g) of coplanar faces whose interiors meet (two int [pairs])."""
-        low, high = self.corners.min(axis=1), self.corners.max(axis=1)
-        found = [np.zeros((0, 2), dtype=np.int64)]
-        offset = (self.corners[:, 0] * normal).sum(axis=1)
-
-        def by_area(f, g):
-            """The larger face first: it knows its plane best."""
-            larger = area[f] >= area[g]
-            return np.where(larger, f, g), np.where(larger, g, f)
-
-        def near_plane(f, g):
-            f, g = by_area(f, g)
-            return np.abs(np.einsum("ij,ij->i", self.corners[g, 0], normal[f]) - offset[f]) <= 2 * self.tolerance
-
-        for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), self.tolerance, near_plane):
-            f, g = by_area(f, g)
-            x = self.corners[g] - self.corners[f, :1]
-            near = np.abs((x * normal[f, None]).sum(axis=2)).max(axis=1) <= self.tolerance
-            f, g = f[near], g[near]
-            axis = np.abs(normal[f]).argmax(axis=1)
-            flat = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
-            meet = _triangles_meet(
-                *(np.take_along_axis(self.corners[k], np.broadcast_to(flat, (len(k), 3, 2)), axis=2) for k in (f, g)),
-                self.tolerance,
-            )
-            found.append(np.column_stack([f[meet], g[meet]]))
-        pairs = np.concatenate(found)
-        return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
-
-    def _find_covered(self):
-        """Which sides belong to others everywhere, judged by a lattice of points."""
-        a, b = (x.ravel() for x in np.indices((LATTICE, LATTICE)))
-        a, b = a[a + b < LATTICE], b[a + b < LATTICE]
-        u, v = (a[:, None] + 1 / 3) / LATTICE, (b[:, None] + 1 / 3) / LATTICE
-        sides, row = np.unique(self._side, return_inverse=True)
-        taken = np.zeros((len(sides), len(u)), dtype=bool)
-        for start in range(0, len(row), CHUNK >> 6):
-            part = slice(start, start + (CHUNK >> 6))
-            corner = self.corners[self._side[part] // 2][:, :, None]
-            points = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
-            np.logical_or.at(taken, row[part], _inside(points, self.corners[self._other[part] // 2]))
-        self.covered.reshape(-1)[sides] = taken.all(axis=1)
-
-    def keep(self, patches):
-        """Forget what hides behind sides that are no ``patches`` (int); returns the faces that really lie in one another."""
+    def among(self, sides):
+        """These overlaps without what hides behind sides other than ``sides`` (int), and the faces that really lie in
+        one another (int)."""
         there = np.zeros(self.covered.size, dtype=bool)
-        there[patches] = True
-        kept = there[self._other]
-        self._side, self._other = self._side[kept], self._other[kept]
-        doubled = self._present[self._side] & (there | self.covered.ravel())[self._side]
-        return np.unique(np.concatenate([self._side[doubled], self._other[doubled]]) // 2)
+        there[sides] = True
+        kept = there[self.over]
+        under, over = self.under[kept], self.over[kept]
+        doubled = self.present[under] & (there | self.covered.ravel())[under]
+        faces = np.unique(np.concatenate([under[doubled], over[doubled]]) // 2)
+        return Overlaps(self.corners, self.present, under, over, self.covered), faces
 
-    def prepare(self, owned, centre):
-        """Tables for ``owner``, on the device."""
-        corner = self.corners - centre
+    def lookup(self, centre) -> "Lookup | None":
+        """The same on the device, for points relative to ``centre``; None if nothing overlaps."""
+        return Lookup(self, centre) if len(self.under) else None
 
-        def vector(kind, a):
-            return kind(*(owned(mi.Float, a[:, k]) for k in range(3)))
 
-        self._tables = [vector(mi.Point3f, corner[:, 0])] + [
-            vector(mi.Vector3f, corner[:, k] - corner[:, 0]) for k in (1, 2)
-        ]
-        self._starts = owned(mi.UInt32, np.searchsorted(self._side, np.arange(self.covered.size + 1)))
-        self._others = owned(mi.UInt32, self._other)
+class Lookup:
+    """Overlaps as tables on the device."""
+
+    def __init__(self, overlaps, centre):
+        corner = overlaps.corners - centre
+        edges = [corner[:, k] - corner[:, 0] for k in (1, 2)]
+        self._triangles = [owned_vectors(mi.Point3f, corner[:, 0]), *(owned_vectors(mi.Vector3f, e) for e in edges)]
+        self._starts = owned(mi.UInt32, np.searchsorted(overlaps.under, np.arange(overlaps.covered.size + 1)))
+        self._over = owned(mi.UInt32, overlaps.over)
 
     @dr.syntax
     def owner(self, face, back, u, v, active):
         """The face, side and coordinates that points (u, v) of sides belong to (UInt32, Bool, Float, Float)."""
         side = 2 * face + dr.select(back, mi.UInt32(1), mi.UInt32(0))
-        p0, e1, e2 = (dr.gather(type(t), t, face, active) for t in self._tables)
+        p0, e1, e2 = (dr.gather(type(t), t, face, active) for t in self._triangles)
         x = p0 + e1 * u + e2 * v
         at = dr.gather(mi.UInt32, self._starts, side, active)
         end = dr.gather(mi.UInt32, self._starts, side + 1, active)
         u, v = mi.Float(u), mi.Float(v)
         while active & (at < end):
-            other = dr.gather(mi.UInt32, self._others, at)
-            q0, q1, q2 = (dr.gather(type(t), t, other >> 1) for t in self._tables)
+            other = dr.gather(mi.UInt32, self._over, at)
+            q0, q1, q2 = (dr.gather(type(t), t, other >> 1) for t in self._triangles)
             normal = dr.cross(q1, q2)
             n2 = dr.squared_norm(normal)
             a, b = dr.dot(dr.cross(x - q0, q2), normal) / n2, dr.dot(dr.cross(q1, x - q0), normal) / n2
@@ -143,6 +79,83 @@ class Overlaps:
             v = dr.select(inside, dr.clip(b, 0, 1), v)
             at = dr.select(inside, end, at + 1)
         return side >> 1, (side & 1) == 1, u, v
+
+
+def find_overlaps(faces, present, exitance, reflectance, tolerance) -> Overlaps:
+    """Look for coplanar faces that share area.
+
+    Per side, front and back: ``present`` (bool [faces, 2]), ``exitance``, ``reflectance`` [faces, 2];
+    ``tolerance``: how far from a plane still counts as in it, m.
+    """
+    f, g = coplanar_pairs(faces.corners, faces.normal, faces.area, ~faces.degenerate, tolerance)
+    order = _precedence(faces, present, exitance, reflectance)
+    opposite = (faces.normal[f] * faces.normal[g]).sum(axis=1) < 0
+    under = np.concatenate([2 * f, 2 * f + 1])
+    over = np.concatenate([2 * g + opposite, 2 * g + 1 - opposite])
+    before = (order[over] < order[under]) & present.ravel()[over]
+    under, over = under[before], over[before]
+    by = np.lexsort([order[over], under])
+    under, over = under[by], over[by]
+    return Overlaps(faces.corners, present.ravel(), under, over, _covered(faces.corners, under, over, present.shape))
+
+
+def _precedence(faces, present, exitance, reflectance):
+    """Place of every side in the order in which points belong to sides (int [2 · faces])."""
+    surface = _surfaces(faces.corners, faces.normal)
+    size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
+    first = np.full(surface.max() + 1, len(faces))
+    np.minimum.at(first, surface, faces.rank)
+    size = np.round(np.log(size + 1e-300), 4)
+    keys = (faces.rank[:, None], first[surface][:, None], reflectance, size[:, None], -exitance, ~present)
+    order = np.empty(present.size, dtype=np.int64)
+    order[np.lexsort([np.broadcast_to(k, present.shape).ravel() for k in keys])] = np.arange(present.size)
+    return order
+
+
+def coplanar_pairs(corners, normal, area, sound, tolerance):
+    """Ordered pairs (f, g) of ``sound`` faces in one plane whose interiors meet (two int [pairs])."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    offset = (corners[:, 0] * normal).sum(axis=1)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+
+    def larger_first(f, g):
+        """The larger face knows its plane best."""
+        larger = area[f] >= area[g]
+        return np.where(larger, f, g), np.where(larger, g, f)
+
+    def near_plane(f, g):
+        f, g = larger_first(f, g)
+        return np.abs(np.einsum("ij,ij->i", corners[g, 0], normal[f]) - offset[f]) <= 2 * tolerance
+
+    for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, near_plane):
+        f, g = larger_first(f, g)
+        height = ((corners[g] - corners[f, :1]) * normal[f, None]).sum(axis=2)
+        near = np.abs(height).max(axis=1) <= tolerance
+        f, g = f[near], g[near]
+        axis = np.abs(normal[f]).argmax(axis=1)
+        kept = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
+        flat = [np.take_along_axis(corners[k], np.broadcast_to(kept, (len(k), 3, 2)), axis=2) for k in (f, g)]
+        meet = _triangles_meet(*flat, tolerance)
+        found.append(np.column_stack([f[meet], g[meet]]))
+    pairs = np.concatenate(found)
+    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+
+
+def _covered(corners, under, over, shape):
+    """Which sides belong to others everywhere, judged by a lattice of points (bool [faces, 2])."""
+    a, b = (x.ravel() for x in np.indices((LATTICE, LATTICE)))
+    a, b = a[a + b < LATTICE], b[a + b < LATTICE]
+    u, v = (a[:, None] + 1 / 3) / LATTICE, (b[:, None] + 1 / 3) / LATTICE
+    sides, row = np.unique(under, return_inverse=True)
+    taken = np.zeros((len(sides), len(u)), dtype=bool)
+    for start in range(0, len(row), CHUNK >> 6):
+        part = slice(start, start + (CHUNK >> 6))
+        corner = corners[under[part] // 2][:, :, None]
+        points = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
+        np.logical_or.at(taken, row[part], _inside(points, corners[over[part] // 2]))
+    covered = np.zeros(shape, dtype=bool)
+    covered.reshape(-1)[sides] = taken.all(axis=1)
+    return covered
 
 
 def _boxes_that_meet(low, high, faces, tolerance, likely):
@@ -193,13 +206,7 @@ def _surfaces(corners, normal):
     f, g = face[joined], face[order[at[joined]]]
     level = (normal[f] * normal[g]).sum(axis=1) > 1 - 1e-6
     f, g = f[level], g[level]
-    label, before = np.arange(n), None
-    while before is None or (label != before).any():
-        before = label.copy()
-        np.minimum.at(label, f, label[g])
-        np.minimum.at(label, g, label[f])
-        label = label[label]
-    return label
+    return components(n, f, g)
 
 
 def _triangles_meet(p, q, tolerance):

@@ -1,12 +1,42 @@
-"""Triangle meshes in the place of shapes that are not meshes."""
+"""Triangle meshes in the place of shapes that are not meshes: one mesher per class of Mitsuba's shapes."""
+
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.plugins import Registry
+
 SEGMENTS = 32
+MESHERS = Registry("shape")
 
 
+def mesher(shape_class: str) -> Callable:
+    """Decorator: the function makes an mi.Mesh of a shape whose ``class_name()`` this is."""
+
+    def register(function):
+        MESHERS.add(shape_class, function)
+        return function
+
+    return register
+
+
+def can_mesh(shape) -> bool:
+    return isinstance(shape, mi.Mesh) or shape.class_name() in MESHERS
+
+
+def as_mesh(shape):
+    """``shape`` itself if it is a mesh, or the mesh its mesher makes."""
+    return shape if isinstance(shape, mi.Mesh) else MESHERS.find(shape.class_name())(shape)
+
+
+def label(shape, index) -> str:
+    """How a shape is called in messages: its id, or its place in the scene."""
+    return f"shape '{shape.id()}'" if shape.id() else f"shape {index}"
+
+
+@mesher("Disk")
 def disk_mesh(disk):
     """A fan of triangles with exactly the area of ``disk``, so that a lamp keeps its power."""
     angle = np.arange(SEGMENTS) / SEGMENTS
@@ -16,21 +46,20 @@ def disk_mesh(disk):
     centre = points.mean(axis=0)
     radius = np.sqrt(2 * np.pi / SEGMENTS / np.sin(2 * np.pi / SEGMENTS))
     outer = centre + 2 * radius * (points - centre)
-    vertices = np.vstack([centre, outer])
     first = np.arange(SEGMENTS) + 1
     second = first % SEGMENTS + 1
     normal = np.array(ring.sh_frame.n).reshape(3, -1)[:, 0]
     if np.dot(np.cross(outer[0] - centre, outer[1] - centre), normal) < 0:
         first, second = second, first
     faces = np.column_stack([np.zeros(SEGMENTS, int), first, second])
-    return build_mesh(disk.id(), vertices, faces, disk.bsdf())
+    return build_mesh(disk, np.vstack([centre, outer]), faces)
 
 
-def build_mesh(name, vertices, faces, bsdf):
-    """An ``mi.Mesh`` without vertex normals from vertices [n, 3], faces [m, 3] and a BSDF."""
+def build_mesh(shape, vertices, faces):
+    """An ``mi.Mesh`` without vertex normals from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``."""
     properties = mi.Properties()
-    properties["mesh_bsdf"] = bsdf
-    mesh = mi.Mesh(name, len(vertices), len(faces), props=properties)
+    properties["mesh_bsdf"] = shape.bsdf()
+    mesh = mi.Mesh(shape.id(), len(vertices), len(faces), props=properties)
     params = mi.traverse(mesh)
     params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())
     params["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).ravel())

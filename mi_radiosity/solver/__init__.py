@@ -1,6 +1,6 @@
-"""Hierarchical Monte Carlo radiosity: elements, pairs, refinement, power; solve() ─► Solution."""
+"""Hierarchical Monte Carlo radiosity: from patches to a mesh, and solve() ─► Solution."""
 
-from .solution import Solution
+from .solution import Leaves, Solution
 from .solve import solve
 
-__all__ = ["Solution", "solve"]
+__all__ = ["Leaves", "Solution", "solve"]

@@ -7,101 +7,214 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import NONE, opaque_index, owned, owned_vectors
 from ..core.errors import RadiosityError
 from ..core.files import writing
+from ..core.llvm import require_variant
+from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed, uniform
+from ..mesh import Elements, Exposure
+from ..mesh.subdivision import NODES
 from ..scene import Model
-from ..scene.faces import owned
-from ..mesh.elements import Elements
+from ..transport import Gatherer
+from ..transport.landings import Landings
 
-FORMAT = 2
-TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale", "open_area", "across")
+FORMAT = 3
+TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
 COLORS = ("reflectance", "direct", "indirect")
+EXPOSURE = ("open_area", "crossed", "slot")
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of linear RGB
+LUMENS_PER_WATT = 179.0  # Radiance's luminous efficacy of white light
 
 
-@dataclass
+@dataclass(frozen=True)
+class Leaves:
+    """The leaves of a solution as NumPy arrays, one row each."""
+
+    vertices: np.ndarray  # [leaves, 3, 3] m, in the coordinates of the scene
+    shape: np.ndarray  # [leaves] number of the shape in scene.shapes()
+    face: np.ndarray  # [leaves] number of the face within its shape
+    back: np.ndarray  # [leaves] bool: the back of the face
+    level: np.ndarray  # [leaves] how often its patch was split
+    area: np.ndarray  # [leaves] m²
+    open_area: np.ndarray  # [leaves] m² that nothing covers
+    irradiance: np.ndarray  # [leaves, 3] W/m²
+    radiosity: np.ndarray  # [leaves, 3] W/m²
+
+    def __len__(self):
+        return len(self.area)
+
+
+@dataclass(frozen=True)
 class Solution:
     """Radiosity of a scene, good for every view of it.
 
-    model: the scene as patches. elements: the element tree. direct, indirect: irradiance H in W/m²
-    (Color3f [elements]) from the first flight of the lamps' light and from all later ones; interior
-    elements hold the area average. stats: the numbers of the run (see README).
+    model: the scene as patches. elements: the mesh. exposure: what of it is open. direct, indirect: irradiance H in
+    W/m² (Color3f [elements]) from the first flight of the lamps' light and from all later ones; interior elements
+    hold the area average. landings: where light came down on leaves that a wall crosses. stats: the numbers of the
+    run (see README).
     """
 
     model: Model
     elements: Elements
+    exposure: Exposure
     direct: "mi.Color3f"
     indirect: "mi.Color3f"
+    landings: Landings
     stats: dict
 
-    def irradiance(self):
-        """H = direct + indirect, W/m² (Color3f [elements])."""
-        return self.direct + self.indirect
+    def irradiance(self, points=None, normals=None, *, lux: bool = False, samples: int = 1024, seed: int = 0):
+        """Irradiance H at any points of the scene, gathered there: W/m² per channel (NumPy [n, 3]), or with ``lux``
+        illuminance, lx (NumPy [n]): 179 lm/W times the luminance of H by Rec. 709's weights.
+
+        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps, and
+        as many rays into the room, per point. Without points: H of all elements (Color3f [elements]).
+        Raises RadiosityError for points or normals that are not finite, or do not fit together.
+        """
+        if points is None:
+            return self.direct + self.indirect
+        points, normals = _checked_points(points, normals)
+        gathered = self._gather(points, normals, samples, seed) if len(points) else np.zeros((0, 3))
+        return LUMENS_PER_WATT * gathered @ LUMINANCE if lux else gathered
 
     def radiosity(self):
         """B = E + ρ H, W/m² (Color3f [elements])."""
-        return (
-            dr.gather(mi.Color3f, self.model.emission, self.elements.patch)
-            + self.elements.reflectance * self.irradiance()
+        return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+
+    def _reflected(self):
+        return self.elements.reflectance * self.irradiance()
+
+    def leaves(self) -> Leaves:
+        """Geometry and light of all leaves, neighbours after neighbours."""
+        e, faces, leaf = self.elements, self.model.faces, self.elements.leaves
+        patch = dr.gather(mi.UInt32, e.patch, leaf)
+        face = np.array(dr.gather(mi.UInt32, e.patches.face, patch))
+        corners = [np.array(e.patches.point(patch, *e.patch_point(leaf, a, b))).T for a, b in NODES[:3]]
+
+        def of(kind, array):
+            return np.array(dr.gather(kind, array, leaf)).T
+
+        return Leaves(
+            vertices=np.stack(corners, axis=1) + faces.centre,
+            shape=faces.shape[face],
+            face=face - np.searchsorted(faces.shape, faces.shape[face]),
+            back=np.array(dr.gather(mi.Bool, e.patches.back, patch)).astype(bool),
+            level=np.array(e.level(leaf)),
+            area=of(mi.Float, e.area),
+            open_area=of(mi.Float, self.exposure.open_area),
+            irradiance=of(mi.Color3f, self.irradiance()),
+            radiosity=of(mi.Color3f, self.radiosity()),
         )
 
-    def render(self, sensor=0, spp=16, shading="gouraud", seed=0):
-        """Picture from a sensor (mi.Sensor or its number) as mi.TensorXf; nothing is solved again."""
-        from ..display import render  # display builds on solver; this is its doorbell
+    def render(self, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+        """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
-        return render(self, sensor, spp=spp, shading=shading, seed=seed)
+        Raises RadiosityError if the scene has been edited since it was solved.
+        """
+        self.require_unchanged()
+        integrator = mi.load_dict({"type": "radiosity"})
+        integrator.show(self, shading)
+        return integrator.picture(self.model.scene, sensor, seed, spp)
 
-    def save(self, path):
+    def require_unchanged(self) -> None:
+        """Raise RadiosityError if the scene is not as it was when it was solved."""
+        if not self.model.state.same_as(self.model.scene):
+            raise RadiosityError("the scene has been edited since it was solved: solve it again")
+
+    def _gather(self, points, normals, samples, seed):
+        patches, rays = self.model.patches, self.model.rays
+        gatherer = Gatherer(self.model, self.elements, self._reflected())
+        each, n = opaque_index(samples), len(points)
+        total, at_once = np.zeros((n, 3)), max(1, (1 << 22) // samples)
+        stream = opaque_index(stream_seed(seed, Stream.MEASURE))
+        for first in range(0, n, at_once):
+            part = slice(first, min(first + at_once, n))
+            k = dr.arange(mi.UInt32, (part.stop - first) * samples)
+            of, line = k // each, k % each
+            x = dr.gather(mi.Point3f, owned_vectors(mi.Point3f, points[part] - self.model.faces.centre), of)
+            normal = dr.gather(mi.Vector3f, owned_vectors(mi.Vector3f, normals[part]), of)
+            key = hash_pair(of + opaque_index(first), 0)
+            a, b, s, t = kronecker(line, key, stream)
+            lot = (mi.Float(line) + uniform(key ^ 0xA511E9B3, stream)) / mi.Float(each)
+            origin = x + patches.origin + normal * patches.lift
+            H = gatherer.direct(x, normal, lot, a, b) + gatherer.indirect(origin, cosine_direction(normal, s, t))
+            total[part] = np.array([dr.block_sum(c, samples) for c in H]).T / samples
+        return total
+
+    # ---- Files ---------------------------------------------------------------------------------
+
+    def save(self, path) -> None:
         """Write the solution as NumPy archive (.npz); no file is left half-written."""
         e = self.elements
         arrays = {name: np.array(getattr(e, name)) for name in TREE}
+        arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
+        arrays |= {"landings": np.array([self.landings.u, self.landings.v]).reshape(2, -1)}
         with writing(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
                 format=FORMAT,
                 fingerprint=self.model.fingerprint,
-                sides=self.model.sides,
+                sides=self.model.patches.sides,
                 stats=json.dumps(self.stats),
                 **arrays,
             )
 
     @staticmethod
-    def load(path, scene):
+    def load(path, scene: "mi.Scene | Model") -> "Solution":
         """Read a solution of ``scene``.
 
         Raises RadiosityError if the file is no solution, is damaged, or belongs to another scene.
         """
-        try:
-            with np.load(path) as file:
-                data = {name: file[name] for name in file.files}
-            if int(data["format"]) != FORMAT:
-                raise RadiosityError(f"{path} was written by another version: solve the scene again")
-            stats = json.loads(str(data["stats"]))
-            fingerprint, sides = str(data["fingerprint"]), data["sides"]
-            tree, colors = {name: data[name] for name in TREE}, {name: data[name] for name in COLORS}
-        except FileNotFoundError:
-            raise RadiosityError(f"{path} does not exist: save a solution first") from None
-        except RadiosityError:
-            raise
-        except Exception as error:
-            raise RadiosityError(
-                f"{path} is not a readable solution ({type(error).__name__}): solve the scene again"
-            ) from None
+        require_variant()
+        data, stats = _read(path)
         model = scene if isinstance(scene, Model) else Model(scene)
-        if fingerprint != model.fingerprint:
+        if str(data["fingerprint"]) != model.fingerprint:
             raise RadiosityError(
                 f"{path} belongs to another scene: solve this one, or load the scene it was saved from"
             )
-        model.use_sides(sides)
-        elements = Elements(model)
-        for name, array in tree.items():
-            setattr(elements, name, owned(mi.Float if array.dtype.kind == "f" else mi.UInt32, array))
+        model = model.with_sides(data["sides"])
+        reflectance, direct, indirect = (owned_vectors(mi.Color3f, data[name].T) for name in COLORS)
+        arrays = {name: owned(mi.Float if data[name].dtype.kind == "f" else mi.UInt32, data[name]) for name in TREE}
+        area = dr.gather(mi.Float, model.patches.area, arrays["patch"]) * arrays["scale"] ** 2
+        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance})
+        crossed = owned(mi.UInt32, data["crossed"]) == 1
+        slots = int((data["slot"] != NONE).sum())
+        exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)
+        return Solution(model, elements, exposure, direct, indirect, Landings(slots, *data["landings"]), stats)
 
-        def color(name):
-            return mi.Color3f(*(owned(mi.Float, c) for c in colors[name]))
 
-        elements.reflectance = color("reflectance")
-        elements.area = dr.gather(mi.Float, model.area, elements.patch) * elements.scale**2
-        elements.leaves = int((tree["child"] == 0).sum())
-        return Solution(model, elements, color("direct"), color("indirect"), stats)
+def _read(path):
+    """The arrays and the statistics in a file."""
+    try:
+        with np.load(path) as file:
+            data = {name: file[name] for name in file.files}
+        if int(data["format"]) != FORMAT:
+            raise RadiosityError(f"{path} was written by another version: solve the scene again")
+        for name in ("fingerprint", "sides", "landings", *TREE, *EXPOSURE, *COLORS):
+            data[name]
+        return data, json.loads(str(data["stats"]))
+    except FileNotFoundError:
+        raise RadiosityError(f"{path} does not exist: save a solution first") from None
+    except RadiosityError:
+        raise
+    except Exception as error:
+        why = type(error).__name__
+        raise RadiosityError(f"{path} is not a readable solution ({why}): solve the scene again") from None
+
+
+def _checked_points(points, normals):
+    """Points and unit normals as float64 [n, 3]."""
+    points = np.atleast_2d(np.asarray(points, dtype=np.float64))
+    normals = np.atleast_2d(np.asarray(normals if normals is not None else [], dtype=np.float64))
+    if points.shape[-1] != 3 or normals.shape[-1] != 3:
+        raise RadiosityError("points and normals must be arrays of the shape [n, 3]")
+    normals = np.broadcast_to(normals, points.shape) if len(normals) == 1 else normals
+    if points.shape != normals.shape:
+        raise RadiosityError(
+            f"{len(points)} points do not fit {len(normals)} normals: give one normal each, or one for all"
+        )
+    length = np.linalg.norm(normals, axis=1)
+    if not np.isfinite(points).all() or not (np.isfinite(length) & (length > 0)).all():
+        raise RadiosityError("points and normals must be finite numbers, and no normal may be zero")
+    return points, normals / length[:, None]

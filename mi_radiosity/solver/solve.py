@@ -1,19 +1,18 @@
 """solve(): one call from a scene to its radiosity."""
 
 import time
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.arrays import totals
 from ..core.errors import RadiosityError, interruptible
+from ..core.points import Stream, stream_seed
+from ..mesh import Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
-from ..core.arrays import totals
-from ..mesh.exposure import find_covered, find_divided
-from ..mesh.elements import Elements
-from ..transport.gather import Starved
-from ..mesh.pairs import Pairs
-from ..transport.series import distribute
+from ..transport import PILOT, Problem, Shooting, Starved, Transport
 from .refine import Refinement
 from .solution import Solution
 
@@ -22,7 +21,19 @@ RAYS_PER_ELEMENT = 300  # default ray budget
 
 
 @interruptible()
-def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=10, seed=0, progress=None):
+def solve(
+    scene: "mi.Scene | Model",
+    oracle: Oracle | None = None,
+    *,
+    elements: int | None = None,
+    epsilon: float | None = None,
+    rays: int | None = None,
+    lines: int = 10,
+    seed: int = 0,
+    transport: Transport | None = None,
+    pilot: Transport = PILOT,
+    progress: Callable[[str, int, int | None], None] | None = None,
+) -> Solution:
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
@@ -30,95 +41,124 @@ def solve(scene, oracle=None, *, elements=None, epsilon=None, rays=None, lines=1
     either, 19,000 more than the scene has patches, or twice the patches, unless the oracle finds less
     to refine. rays: rays that carry the power, used exactly; 300 per element by default. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
-    progress: called with (stage, done, total), stage
-    being "refine" or "distribute" (total is None where it is not known).
+    transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
+    default. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
+    it is not known).
 
     Returns a Solution. Raises RadiosityError for options and scenes that cannot be used.
     """
-    oracle = GMI(0.5) if oracle is None else oracle
-    if not isinstance(oracle, Oracle):
-        raise RadiosityError(
-            f"the oracle must be an instance of mi_radiosity.Oracle, such as GMI(alpha=0.5), not {oracle!r}"
-        )
-    if elements is not None and epsilon is not None:
-        raise RadiosityError("give either --elements or --epsilon, not both")
-    for name, value in (("elements", elements), ("rays", rays), ("lines", lines)):
-        if value is not None and (value != int(value) or value <= 0):
-            raise RadiosityError(f"--{name} must be a whole number greater than 0, not {value}")
-    if epsilon is not None and not 0 < epsilon < float("inf"):
-        raise RadiosityError(f"--epsilon must be a number greater than 0, not {epsilon}")
-    report = progress or (lambda stage, done, total: None)
-
-    clock = [time.perf_counter()]
-
-    def lap():
-        dr.sync_thread()
-        clock.append(time.perf_counter())
-        return clock[-1] - clock[-2]
+    oracle, transport = oracle or GMI(0.5), transport or Shooting()
+    _check(oracle, elements, epsilon, rays, lines)
+    report, clock = progress or (lambda stage, done, total: None), _Clock()
 
     model = scene if isinstance(scene, Model) else Model(scene)
-    exact = elements is not None
-    if epsilon is None and elements is None:
-        elements = model.count + max(ELEMENTS, model.count)
-    if elements is not None and elements < model.count:
-        raise RadiosityError(
-            f"the scene has {model.count} patches, so {elements} elements cannot be reached: ask for at least {model.count} --elements"
-        )
-    seconds = {"scene": lap()}
+    wanted = _wanted(model, elements, epsilon)
+    clock.lap("scene")
 
-    tree = Elements(model)
-    pairs = Pairs(tree, oracle, int(lines), seed & 0xFFFFFFFF)
+    tree = Tree(model.patches, model.materials)
+    pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
-        pairs, elements, epsilon, seed & 0xFFFFFFFF, lambda done: report("refine", done, elements), exact
+        model,
+        tree,
+        pairs,
+        pilot,
+        wanted,
+        epsilon,
+        seed,
+        lambda done: report("refine", done, wanted),
+        elements is not None,
     )
     refinement.run()
-    find_covered(tree, seed & 0xFFFFFFFF)
-    find_divided(tree)
-    seconds["refine"] = lap()
+    mesh = tree.freeze()
+    problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
+    clock.lap("refine")
 
-    rays = int(rays or RAYS_PER_ELEMENT * tree.leaves)
-    starved = Starved(tree, rays, seed & 0xFFFFFFFF)
-    flow = distribute(
-        pairs,
+    rays = int(rays or RAYS_PER_ELEMENT * tree.leaf_count)
+    starved = Starved(problem, rays, seed)
+    flow = transport(
+        problem,
         rays - starved.rays,
-        seed & 0xFFFFFFFF,
-        first_share=refinement.first_share,
-        progress=lambda done: report("distribute", done + starved.rays, rays),
+        stream_seed(seed, Stream.POWER),
+        refinement.first_share,
+        lambda done: report("distribute", done + starved.rays, rays),
     )
-    power = _balance(tree, flow)
-    starved.feed(flow)
-    seconds["distribute"] = lap()
-    seconds["total"] = clock[-1] - clock[0]
+    power = _balance(problem, flow)
+    flow = starved.feed(flow)
+    clock.lap("distribute")
 
     stats = {
-        "elements": tree.leaves,
-        "patches": model.count,
+        "elements": tree.leaf_count,
+        "patches": model.patches.count,
         "pairs": pairs.evaluated,
-        "rays": flow.rays + starved.rays,
+        "rays": flow.rays,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0,
         "pilot_rays": refinement.rays,
         "iterations": flow.iterations,
         "power": power,
-        "seconds": seconds,
+        "seconds": clock.seconds(),
         "epsilon": refinement.epsilon,
         "oracle": oracle.name,
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
     }
-    return Solution(model, tree, flow.direct, flow.indirect, stats)
+    return Solution(model, mesh, problem.exposure, flow.direct, flow.indirect, flow.landings, stats)
 
 
-def _balance(tree, flow):
+def _check(oracle, elements, epsilon, rays, lines):
+    """Refuse options that make no sense."""
+    if not isinstance(oracle, Oracle):
+        raise RadiosityError(
+            f"the oracle must be an instance of mi_radiosity.Oracle, such as GMI(alpha=0.5), not {oracle!r}"
+        )
+    if elements is not None and epsilon is not None:
+        raise RadiosityError("give either elements or epsilon, not both")
+    for name, value in (("elements", elements), ("rays", rays), ("lines", lines)):
+        if value is not None and (value != int(value) or value <= 0):
+            raise RadiosityError(f"{name} must be a whole number greater than 0, not {value}")
+    if epsilon is not None and not 0 < epsilon < float("inf"):
+        raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
+
+
+def _wanted(model, elements, epsilon):
+    """Leaves to refine to, or None where ε decides."""
+    count = model.patches.count
+    if epsilon is not None:
+        return None
+    if elements is None:
+        return count + max(ELEMENTS, count)
+    if elements < count:
+        raise RadiosityError(
+            f"the scene has {count} patches, so {elements} elements cannot be reached: ask for at least {count} elements"
+        )
+    return elements
+
+
+class _Clock:
+    """Seconds by stage."""
+
+    def __init__(self):
+        self._start = self._last = time.perf_counter()
+        self._stages = {}
+
+    def lap(self, stage):
+        dr.sync_thread()
+        now = time.perf_counter()
+        self._stages[stage], self._last = now - self._last, now
+
+    def seconds(self):
+        return self._stages | {"total": self._last - self._start}
+
+
+def _balance(problem, flow):
     """Emitted, absorbed, escaped and unshot power in W, channels added up.
 
     What is absorbed comes from the irradiance of the solution, not from counting rays.
     """
-    leaves = tree.leaf_indices()
+    leaves, elements = problem.elements.leaves, problem.elements
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)
-    absorbed = (
-        (1 - dr.gather(mi.Color3f, tree.reflectance, leaves)) * irradiance * dr.gather(mi.Float, tree.open_area, leaves)
-    )
+    lost = 1 - dr.gather(mi.Color3f, elements.reflectance, leaves)
+    absorbed = lost * irradiance * dr.gather(mi.Float, problem.exposure.open_area, leaves)
     return {
         "emitted": sum(flow.emitted),
         "absorbed": sum(totals([mi.Float64(a) for a in absorbed])) + sum(flow.blocked),

@@ -1,280 +1,179 @@
-"""Distribution of power over the hierarchy: stochastic Jacobi radiosity with an exact ray budget."""
+"""Transport of power over a mesh: the Neumann series of radiosity by stochastic Jacobi iterations."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
-from ..scene.model import NONE
-from ..core.points import ROUNDS, hash_pair, kronecker, triangle
-from ..core.arrays import ColorSums, lower_bound, opaque_index, power_of_two, totals
-from ..mesh.exposure import note_light
+from ..core.arrays import NONE, totals
+from ..core.points import hash_pair
+from ..mesh.hierarchy import pull, push
+from .deposit import pair_of, spread, trusted
+from .emit import LampEmitter, LeafEmitter, numbered_by_leaf, numbered_through
+from .landings import Landings
+from .problem import Flow, Problem, Record
+from .tally import Tally
 
-TAIL = 0.01  # share of the power below which the rest is summed in closed form
-ITERATIONS = 64  # after so many the rest is summed in closed form, too
-SEATS = 8  # points of a divided leaf that it sends light from
-AT_ONCE = 1 << 23  # rays cast in one launch: bounds memory, and the time until an interrupt is heard
-WEIGHTS = 2.0**46  # resolution of the ray distribution over elements
-
-
-@dataclass
-class Flow:
-    """What one power distribution did. Power in W per channel, irradiance in W/m² per element.
-
-    ``direct`` and ``indirect`` are Color3f [elements], right at the leaves and pulled to their
-    ancestors.
-    """
-
-    direct: "mi.Color3f" = None
-    indirect: "mi.Color3f" = None
-    rays: int = 0
-    iterations: int = 0
-    first_share: float = 1.0  # of the power shot in all, the lamps' part
-    emitted: list = field(default_factory=lambda: [0.0] * 3)
-    escaped: list = field(default_factory=lambda: [0.0] * 3)
-    blocked: list = field(default_factory=lambda: [0.0] * 3)  # absorbed by sides that reflect nothing
-    unshot: list = field(default_factory=lambda: [0.0] * 3)
+ITERATIONS = 64  # after so many the rest is summed in closed form
+LEAST_RAYS = 64  # of an iteration
 
 
-@dataclass
-class RayRecord:
-    """The rays of a pilot, to discover pairs with: source (j, uj, vj) to receiver (i, ui, vi)."""
+class Transport:
+    """A way to carry the power of a scene over its mesh: called with a Problem, an exact number of rays and a seed, it
+    returns a Flow. progress is told the rays done so far; first_share, where it is known, is the lamps' part of all
+    power shot."""
 
-    i: "mi.UInt32"
-    ui: "mi.Float"
-    vi: "mi.Float"
-    j: "mi.UInt32"
-    uj: "mi.Float"
-    vj: "mi.Float"
-    pair: "mi.UInt32"  # where each ray stands in the pair tree, NONE before its root exists
+    def __call__(
+        self,
+        problem: Problem,
+        rays: int,
+        seed: int,
+        first_share: float = 0.5,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Flow:
+        raise NotImplementedError
 
 
-def distribute(pairs, rays, seed, *, first_share=0.5, tail=TAIL, record=None, progress=lambda done: None):
-    """Shoot all power of the scene over elements and pairs with ``rays`` rays. Returns a Flow.
+@dataclass(frozen=True)
+class Shooting(Transport):
+    """Shoots all power with rays that leave it at pairs (`deposit`), iteration after iteration.
 
-    B = E + ρ H is summed as the Neumann series Σ_k H_k of irradiances (eq. 1). Iteration k shoots
-    the power ρ H_(k−1) A that is unshot, with rays in proportion to it: systematic over the
-    elements, cosine-distributed, low-discrepancy in position and direction. A ray leaves its power
-    at the receiver of the first pair without children on its way down; where nobody has evaluated
-    that pair, something stands between the two, or a wall stands on the receiver, at the leaf it
-    meets. Leaves that a wall divides send light from where it came down: no light behind walls.
+    B = E + ρ H is summed as the Neumann series Σ_k H_k of irradiances (eq. 1). Iteration k shoots the power
+    ρ H_(k−1) A that is unshot, with rays in proportion to it (`LeafEmitter`).
 
-    The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration,
-    every later one takes 1 − λ of the rays left, so that all rays carry about the same power. Once
-    less than ``tail`` of the power is left, the last iteration stands for all that would follow,
-    H_k (1 + λ + λ² + …) (Lyusternik's closure): no power is lost however large ρ is.
+    The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration, every later one
+    takes 1 − λ of the rays left, so that all rays carry about the same power. Once less than ``tail`` of the power is
+    left, the last iteration stands for all that would follow, H_k (1 + λ + λ² + …) (Lyusternik's closure): no power
+    is lost however large ρ is.
 
-    record: a list that receives the RayRecord of every iteration; then power stays at unevaluated
-    pairs, which spreads it smoothly. progress is told the rays done so far.
+    tail: share of the power below which the rest is summed in closed form. numbering: which points rays have.
+    deposit: who receives their power. records: keep the rays, to discover pairs with.
     Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
     """
-    elements, model = pairs.elements, pairs.elements.model
-    leaves = elements.leaf_indices()
-    area = mi.Float64(dr.gather(mi.Float, elements.open_area, leaves))
-    divided = (
-        dr.gather(mi.UInt32, leaves, dr.compress(dr.gather(mi.Bool, elements.divided, leaves)))
-        if record is None
-        else None
-    )
-    reflectance = dr.gather(mi.Color3f, elements.reflectance, leaves)
-    emission = dr.gather(mi.Color3f, model.emission, dr.gather(mi.UInt32, elements.patch, leaves))
-    power = [mi.Float64(e) * area for e in emission]  # unshot, per channel [leaves]
-    direct, indirect = ([dr.zeros(mi.Float64, dr.width(leaves)) for _ in range(3)] for _ in range(2))
 
-    flow = Flow()
-    unshot = flow.emitted = totals(power)
-    share, left, shot, seats = first_share, rays, 0.0, None
-    while left > 0 and sum(unshot) > 0:
-        last = flow.iterations > 0 and (
-            flow.iterations == ITERATIONS - 1 or sum(unshot) <= tail * share * sum(flow.emitted)
-        )
-        count = left if last else min(left, max(64, round(left * share)))
-        if record is None:
-            sums, seats = _shoot(
-                pairs,
-                leaves,
-                power,
-                unshot,
-                count,
-                flow.iterations,
-                seed,
-                lambda cast: progress(rays - left + cast),
-                seats,
-            )
-            if dr.width(divided):
-                leaf = dr.repeat(divided, SEATS)
-                note_light(elements, leaf, *seats.points(leaf, dr.arange(mi.UInt32, dr.width(leaf))))
-        else:
-            sums, rays_seen = _shoot(
-                pairs, leaves, power, unshot, count, flow.iterations, seed, lambda cast: None, pilot=True
-            )
-            record.append(rays_seen)
-        left -= count
+    tail: float = 0.01
+    numbering: Callable = numbered_through
+    deposit: Callable = trusted
+    records: bool = False
+
+    def __call__(self, problem, rays, seed, first_share=0.5, progress=lambda done: None):
+        series = _Series(self, problem, rays, seed, first_share)
+        while series.left > 0 and sum(series.unshot) > 0:
+            series.iterate(progress)
+        return series.flow()
+
+
+PILOT = Shooting(tail=0.1, numbering=numbered_by_leaf, deposit=spread, records=True)
+
+
+class _Series:
+    """One run of Shooting."""
+
+    def __init__(self, how, problem, rays, seed, first_share):
+        self.how, self.problem, self.seed, self.rays = how, problem, seed, rays
+        elements, area = problem.elements, problem.exposure.open_area
+        self.area = mi.Float64(dr.gather(mi.Float, area, elements.leaves))
+        self.reflectance = [mi.Float64(r) for r in dr.gather(mi.Color3f, elements.reflectance, elements.leaves)]
+        self.power = [mi.Float64(e) * self.area for e in elements.emission(elements.leaves)]
+        self.lamps = [(LampEmitter(light), list(light.power())) for light in problem.model.lights.free]
+        self.on_surfaces = totals(self.power)
+        self.unshot = [sum(p) for p in zip(self.on_surfaces, *(power for _, power in self.lamps))]
+        self.emitted, self.escaped, self.blocked = self.unshot, [0.0] * 3, [0.0] * 3
+        n = dr.width(elements.leaves)
+        self.direct, self.indirect = ([dr.zeros(mi.Float64, n) for _ in range(3)] for _ in range(2))
+        self.share, self.left, self.shot, self.iteration = first_share, rays, 0.0, 0
+        self.landings, self.all_landings = None, Landings(problem.exposure.slots)
+        self.records: list[Record] = []
+
+    def iterate(self, progress):
+        """Shoot what is unshot; what is reflected of it becomes the unshot power of the next iteration."""
+        little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted)
+        last = self.iteration > 0 and (self.iteration == ITERATIONS - 1 or little)
+        count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * self.share)))
+        tally = self._shoot(count, progress)
+        self.left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
-        scale = [u / s if s > 0 else 0.0 for u, s in zip(unshot, sums.totals())]
-        received = _push(elements, sums, leaves, scale)
-        power = [h * mi.Float64(r) * area for h, r in zip(received, reflectance)]
-        after = totals(power)
-        closure = [1 / max(1 - a / u, 1e-6) if left == 0 and u > 0 else 1.0 for a, u in zip(after, unshot)]
-        first = flow.iterations == 0
+        scale = [u / s if s > 0 else 0.0 for u, s in zip(self.unshot, tally.totals())]
+        received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
+        received = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
+        dr.eval(received)
+        self.power = [h * r * self.area for h, r in zip(received, self.reflectance)]
+        after = totals(self.power)
+        closes = self.left == 0
+        closure = [1 / max(1 - a / u, 1e-6) if closes and u > 0 else 1.0 for a, u in zip(after, self.unshot)]
+        self._add(received, closure)
+        for lost, which in ((self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED)):
+            lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
+        self.shot += sum(u * c for u, c in zip(self.unshot, closure))
+        self.share = 1 - min(sum(after) / sum(self.unshot), 0.999)
+        self.unshot = after if self.left else [0.0] * 3
+        self.iteration += 1
+
+    def _add(self, received, closure):
+        """Add irradiance to the sums; what comes from lamps is direct, once."""
+        first = self.iteration == 0
         for c in range(3):
-            once, more = received[c], received[c] * dr.opaque(mi.Float64, closure[c] - first)
-            direct[c], indirect[c] = (
-                (direct[c] + once, indirect[c] + more) if first else (direct[c], indirect[c] + more)
-            )
-            lost = [sums.gather(opaque_index(len(elements) + k))[c][0] * scale[c] * closure[c] for k in range(2)]
-            flow.escaped[c] += lost[0]
-            flow.blocked[c] += lost[1]
-        dr.eval(direct, indirect, power)
-        shot += sum(u * c for u, c in zip(unshot, closure))
-        share = 1 - min(sum(after) / sum(unshot), 0.999)
-        unshot = after if left else [0.0] * 3
-        flow.iterations += 1
-    flow.rays, flow.unshot = rays - left, unshot
-    flow.first_share = sum(flow.emitted) / shot
-    flow.direct, flow.indirect = (pull(elements, leaves, area, irradiance) for irradiance in (direct, indirect))
-    return flow
+            more = received[c] * dr.opaque(mi.Float64, closure[c] - first)
+            self.indirect[c] = self.indirect[c] + more
+            if first:
+                self.direct[c] = self.direct[c] + received[c]
+        dr.eval(self.direct, self.indirect, self.power)
 
+    def _emitters(self, count):
+        """Who shoots in this iteration, and how many rays."""
+        if self.iteration or not self.lamps:
+            return [(LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings), count)]
+        shares = [(emitter, round(count * sum(power) / sum(self.unshot))) for emitter, power in self.lamps]
+        rest = count - sum(n for _, n in shares)
+        if sum(self.on_surfaces) > 0:
+            surfaces = LeafEmitter(self.problem, self.power, sum(self.on_surfaces), self.how.numbering)
+            return [(surfaces, max(rest, LEAST_RAYS))] + shares
+        return [(shares[0][0], shares[0][1] + rest), *shares[1:]]
 
-def _shoot(pairs, leaves, power, unshot, count, iteration, seed, progress, seats=None, pilot=False):
-    """Cast ``count`` rays from leaves in proportion to ``power``; sum what arrives where.
+    def _shoot(self, count, progress):
+        """Cast ``count`` rays and tally what arrives where."""
+        tally, landings = Tally(len(self.problem.elements), self.unshot), Landings(self.problem.exposure.slots)
+        cast = self.rays - self.left
+        for emitter, share in self._emitters(count):
+            for batch in emitter.batches(share, self.iteration, self.seed):
+                self._cast(batch, tally, landings)
+                cast += dr.width(batch.number)
+                progress(cast)
+        self.landings = landings.settled()
+        return tally
 
-    Returns the sums per element, followed by two bins for power that escapes and that is blocked,
-    and the RayRecord if ``pilot``, else the Seats for the next iteration. progress is told how many
-    of the rays are cast.
-    """
-    elements, model = pairs.elements, pairs.elements.model
-    # Integer weights: the distribution is the same on any number of threads.
-    scale = dr.opaque(mi.Float64, WEIGHTS / power_of_two(sum(unshot)))
-    weight = mi.UInt64(dr.ceil((power[0] + power[1] + power[2]) * scale))
-    cumulative = dr.cumsum(weight)
-    dr.eval(cumulative, weight)
-    whole = dr.gather(mi.UInt64, cumulative, dr.width(cumulative) - 1)[0]
-
-    key = opaque_index(seed)
-    jitter = mi.sample_tea_float32(opaque_index(iteration), key ^ 0x5EED, ROUNDS)
-    dr.eval(jitter)
-    spacing, n = dr.opaque(mi.Float64, whole / count), len(elements)
-    sums, taken = ColorSums(n + 2, [4 * u for u in unshot]), None if pilot else Seats(n)
-    for first in range(0, count, AT_ONCE):
-        ray = opaque_index(first) + dr.arange(mi.UInt32, min(AT_ONCE, count - first))
-        k = lower_bound(cumulative, mi.UInt64((mi.Float64(ray) + jitter) * spacing) + 1)
-        source = dr.gather(mi.UInt32, leaves, k)
-        if pilot:
-            # Numbered within their leaf, so that what happens elsewhere leaves the mesh here alone.
-            start = mi.Float64(dr.gather(mi.UInt64, cumulative, k) - dr.gather(mi.UInt64, weight, k)) / spacing - jitter
-            number, owner = ray - mi.UInt32(dr.maximum(dr.ceil(start), 0)), elements.key(leaves)
-            x0, x1, d0, d1 = kronecker(number, owner, key ^ hash_pair(opaque_index(iteration), key), k)
-        else:
-            # Numbered through: rays of neighbouring leaves are well spread among each other.
-            x0, x1, d0, d1 = kronecker(ray, opaque_index(iteration), key)
-        j = dr.gather(mi.UInt32, elements.patch, source)
-        uj, vj = elements.patch_point(source, *triangle(x0, x1))
-        seated = dr.gather(mi.Bool, elements.divided, source) if seats else dr.full(mi.Bool, False, dr.width(ray))
-        if seats:
-            uj, vj = (dr.select(seated, at, x) for at, x in zip(seats.points(source, ray, seated), (uj, vj)))
-        hit = model.trace(*model.leave(j, uj, vj, d0, d1))
-
+    def _cast(self, batch, tally, landings):
+        problem = self.problem
+        hit = problem.model.rays.trace(batch.origin, batch.direction)
+        pair = pair_of(problem, batch, hit)
+        receiver = self.how.deposit(problem, hit, pair)
         on_patch = hit.patch != NONE
-        pair = pairs.find_roots(hit.patch, j, on_patch)
-        known = pair != NONE
-        pair = pairs.descend(pair, hit.u, hit.v, uj, vj, known)
-        receiver = dr.select(known, dr.gather(mi.UInt32, pairs.receiver, pair, known), hit.patch)
-        if not pilot:
-            vetted = (
-                known
-                & (dr.gather(mi.Float, pairs.sigma, pair, known) >= 0)
-                & ~dr.gather(mi.Bool, pairs.partial, pair, known)
-            )
-            vetted &= ~dr.gather(mi.Bool, elements.divided, receiver, known)
-            receiver = elements.leaf_at(receiver, hit.u, hit.v, on_patch & ~vetted)
-        bin = dr.select(on_patch, receiver, dr.select(hit.valid, opaque_index(n + 1), opaque_index(n)))
-        # Rays that start inside a solid or under a face go nowhere; the others of their element carry their power.
-        share = dr.gather(mi.Float, elements.open_area, source) / dr.gather(mi.Float, elements.area, source)
-        share = dr.select(seated, 1, share)
-        starts = ((share >= 1) | on_patch | ~hit.valid) & model.owns(j, uj, vj)
-        each = spacing / (mi.Float64(dr.gather(mi.UInt64, weight, k)) * mi.Float64(share))
-        sums.add([dr.gather(mi.Float64, p, k) * each for p in power], bin, starts)
-        if pilot:
-            taken = RayRecord(hit.patch, hit.u, hit.v, j, uj, vj, dr.select(known, pair, NONE))
-            dr.eval(taken.i, taken.ui, taken.vi, taken.j, taken.uj, taken.vj, taken.pair)
-        else:
-            taken.take(receiver, hit.u, hit.v, ray, on_patch & dr.gather(mi.Bool, elements.divided, receiver, on_patch))
-        progress(first + dr.width(ray))
-    if not pilot:
-        taken.settle()
-    return sums, taken
+        # Rays that start inside a solid go nowhere; the others of their element carry their power.
+        tally.add(batch.power, hit, receiver, batch.starts & (~batch.doubtful | on_patch | ~hit.valid))
+        if self.how.records:
+            record = Record(hit.patch, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)
+            dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
+            self.records.append(record)
+        if landings.slots:
+            slot = dr.gather(mi.UInt32, problem.exposure.slot, receiver, on_patch)
+            number = hash_pair(batch.number, mi.UInt32(self.iteration))
+            for seats in (landings, self.all_landings):
+                seats.offer(slot, hit.u, hit.v, number, on_patch & (slot != NONE))
 
-
-class Seats:
-    """Points where light came down on divided leaves, which send it on from there: SEATS per leaf, drawn at random."""
-
-    def __init__(self, elements):
-        self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * elements)
-        self._uv = [dr.full(mi.Float, dr.nan, SEATS * elements) for _ in range(2)]
-
-    def take(self, leaf, u, v, ray, active):
-        """Offer the patch points (u, v) where rays (UInt32 [n]) meet leaves."""
-        dr.eval(leaf, u, v, active)  # lest the rays be traced again
-        offer = dr.compress(active)
-        if dr.width(offer) == 0:
-            return
-        # The least of well mixed numbers: any of them, but the same on any number of threads.
-        ray = dr.gather(mi.UInt32, ray, offer)
-        number = hash_pair(ray, 0)
-        seat, lot = (
-            SEATS * dr.gather(mi.UInt32, leaf, offer) + number % SEATS,
-            (mi.UInt64(number) << 32) | mi.UInt64(ray),
+    def flow(self):
+        elements, area = self.problem.elements, self.problem.exposure.open_area
+        direct, indirect = (pull(elements, values, area) for values in (self.direct, self.indirect))
+        return Flow(
+            direct=direct,
+            indirect=indirect,
+            landings=self.all_landings.settled(),
+            rays=self.rays - self.left,
+            iterations=self.iteration,
+            first_share=sum(self.emitted) / self.shot if self.shot else 1.0,
+            emitted=self.emitted,
+            escaped=self.escaped,
+            blocked=self.blocked,
+            unshot=self.unshot,
+            records=tuple(self.records),
         )
-        dr.scatter_reduce(dr.ReduceOp.Min, self._least, lot, seat, mode=dr.ReduceMode.Direct)
-        drawn = dr.gather(mi.UInt64, self._least, seat) == lot
-        for points, x in zip(self._uv, (u, v)):
-            dr.scatter(points, dr.gather(mi.Float, x, offer), seat, drawn)
-        dr.eval(self._uv)
-
-    def settle(self):
-        """Share seats with those that were left empty, once all rays are cast."""
-        k = dr.arange(mi.UInt32, dr.width(self._least))
-        for step in (1, 2, 4):
-            other = (k & ~mi.UInt32(SEATS - 1)) | ((k + step) & (SEATS - 1))
-            self._uv = [dr.select(dr.isnan(x), dr.gather(mi.Float, x, other), x) for x in self._uv]
-            dr.eval(self._uv)
-
-    def points(self, leaf, number, active=True):
-        """Patch points of leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light came down."""
-        return [dr.gather(mi.Float, x, SEATS * leaf + number % SEATS, active) for x in self._uv]
-
-
-def _push(elements, sums, leaves, scale):
-    """Irradiance of leaves: what they and their ancestors received per area (3 Float64 [leaves])."""
-    received = _sum_ancestors(elements, sums, leaves)
-    result = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
-    dr.eval(result)
-    return result
-
-
-@dr.syntax
-def _sum_ancestors(elements, sums, leaves):
-    """Power over area, added up from the leaves to their roots (3 Float64 [leaves])."""
-    element, n = mi.UInt32(leaves), dr.width(leaves)
-    r, g, b = dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n), dr.zeros(mi.Float64, n)
-    climbing = dr.full(mi.Bool, True, n)
-    while climbing:
-        area = mi.Float64(dr.gather(mi.Float, elements.open_area, element))
-        x, y, z = sums.gather(element)
-        r, g, b = r + x / area, g + y / area, b + z / area
-        parent = dr.gather(mi.UInt32, elements.parent, element)
-        climbing = parent != element
-        element = parent
-    return [r, g, b]
-
-
-def pull(elements, leaves, area, irradiance):
-    """Area averages of leaf irradiance for all elements (Color3f [elements])."""
-    power = [h * area for h in irradiance]
-    sums = ColorSums(len(elements), [2 * t for t in totals(power)])
-    elements.add_to_ancestors(sums, leaves, power)
-    every = dr.arange(mi.UInt32, len(elements))
-    result = mi.Color3f(*(mi.Float(p / mi.Float64(elements.open_area)) for p in sums.gather(every)))
-    dr.eval(result)
-    return result

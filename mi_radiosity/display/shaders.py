@@ -1,0 +1,108 @@
+"""Shadings: how a solution looks where a camera ray meets it. One class each, known by its name."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.plugins import Registry
+from ..scene.rays import Hit
+from ..solver import Solution
+from .field import Field
+
+LINE_WIDTH = 1.0  # pixels
+LINE_SHADE = 0.25  # of the picture under an element outline
+SHADERS = Registry("shading")
+
+
+@dataclass
+class Look:
+    """Camera rays and what they meet; one entry per ray."""
+
+    ray: "mi.RayDifferential3f"
+    hit: Hit
+    leaf: "mi.UInt32"  # the element at the hit
+    reflectance: "mi.Color3f"  # ρ at the hit, textures and all
+    lit: "mi.Bool"  # the ray meets a patch; the others are black
+    sampler: "mi.Sampler"
+    pixel: "mi.Float"  # width of a pixel in units of the ray differentials
+
+
+class Shader:
+    """A way to show a Solution. A subclass gives itself a ``name``, by which the command line, XML and
+    `Solution.render` know it from then on, and defines `irradiance`, or `radiance` itself."""
+
+    name = ""
+
+    def __init_subclass__(cls, **options):
+        super().__init_subclass__(**options)
+        if "name" in vars(cls):
+            SHADERS.add(cls.name, cls)
+
+    def __init__(self, solution: Solution):
+        self.solution = solution
+
+    def irradiance(self, look: Look) -> "mi.Color3f":
+        """H where rays meet patches, W/m² (Color3f [rays])."""
+        raise NotImplementedError(f"{type(self).__name__} must define irradiance(look)")
+
+    def radiance(self, look: Look) -> "mi.Color3f":
+        """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays])."""
+        emission = dr.gather(mi.Color3f, self.solution.model.patches.emission, look.hit.patch, look.lit)
+        return (emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
+
+
+class Gouraud(Shader):
+    """Irradiance as a continuous field, see `Field`."""
+
+    name = "gouraud"
+
+    def __init__(self, solution):
+        super().__init__(solution)
+        self.field = Field(solution)
+
+    def irradiance(self, look):
+        return self.field.at(look.leaf, look.hit.u, look.hit.v, look.lit)
+
+
+class Flat(Shader):
+    """Every element in its own irradiance."""
+
+    name = "flat"
+
+    def __init__(self, solution):
+        super().__init__(solution)
+        self._irradiance = solution.irradiance()
+
+    def irradiance(self, look):
+        return dr.gather(mi.Color3f, self._irradiance, look.leaf, look.lit)
+
+
+class Mesh(Gouraud):
+    """Gouraud, with the outlines of the elements."""
+
+    name = "mesh"
+
+    def radiance(self, look):
+        return super().radiance(look) * dr.select(self._on_outline(look), LINE_SHADE, 1)
+
+    def _on_outline(self, look):
+        """Is a pixel within half a line of the border of its leaf?"""
+        patches, elements, ray = self.solution.model.patches, self.solution.elements, look.ray
+        patch = dr.select(look.lit, look.hit.patch, 0)
+        p0 = dr.gather(mi.Point3f, patches.p0, patch) + patches.origin
+        e1, e2 = dr.gather(mi.Vector3f, patches.e1, patch), dr.gather(mi.Vector3f, patches.e2, patch)
+        normal = dr.cross(e1, e2)
+        n2 = dr.squared_norm(normal)
+
+        def local(origin, direction):
+            """Barycentric coordinates on the leaf where a ray meets the plane of its patch."""
+            x = origin + direction * (dr.dot(p0 - origin, normal) / dr.dot(direction, normal)) - p0
+            u, v = dr.dot(dr.cross(x, e2), normal) / n2, dr.dot(dr.cross(e1, x), normal) / n2
+            a, b = elements.own_point(look.leaf, u, v, look.lit)
+            return mi.Vector3f(1 - a - b, a, b)
+
+        here = local(ray.o, ray.d)
+        dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
+        per_pixel = dr.sqrt(dx * dx + dy * dy) * look.pixel
+        return look.lit & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)

@@ -1,0 +1,84 @@
+"""The table of patches: oriented sides of faces."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import NONE, owned, owned_vectors
+
+RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
+CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Patches:
+    """One row per patch: a side of a face that light can reach, the front (where the shading normal points) or the
+    back, where the BSDF is two-sided. Dr.Jit arrays [patches]; lengths are scene units, called metres throughout.
+
+    A point of a patch is p₀ + u e₁ + v e₂, relative to the ``origin`` of all points (the centre of the scene, for
+    the sake of float32); (u, v) are the barycentric coordinates Mitsuba uses.
+    """
+
+    count: int
+    sides: np.ndarray  # 2 · the face's rank + (1 for the back): names a patch whatever Mitsuba's order of shapes
+    face: "mi.UInt32"
+    back: "mi.Bool"
+    p0: "mi.Point3f"
+    e1: "mi.Vector3f"
+    e2: "mi.Vector3f"
+    normal: "mi.Vector3f"  # unit, towards the side
+    area: "mi.Float"  # m²
+    reflectance: "mi.Color3f"  # ρ, mean over the patch
+    emission: "mi.Color3f"  # E = π L_e, W/m²
+    total_area: float  # m²
+    origin: "mi.Point3f"
+    lift: "mi.Float"  # by which rays start off a surface, m
+    corners: list  # three Point3f where the file has them, to the bit
+
+    def point(self, patch, u, v):
+        """Points of patches, relative to the origin (Point3f [n])."""
+        along, across = dr.gather(mi.Vector3f, self.e1, patch), dr.gather(mi.Vector3f, self.e2, patch)
+        return dr.gather(mi.Point3f, self.p0, patch) + along * u + across * v
+
+    def above(self, patch, u, v):
+        """Points of patches, lifted off them by the rounding of rays (Point3f [n])."""
+        return mi.Point3f(self.point(patch, u, v) + dr.gather(mi.Vector3f, self.normal, patch) * self.lift)
+
+
+def make_patches(faces, materials, lights, sides) -> Patches:
+    """Patches of the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
+    face, back = np.argsort(faces.rank)[sides // 2], sides % 2
+    sign, emits = np.where(back == 1, -1.0, 1.0)[:, None], (back == 0)[:, None]
+    corners = faces.corners[face]
+    return Patches(
+        count=len(sides),
+        sides=sides,
+        face=owned(mi.UInt32, face),
+        back=owned(mi.UInt32, back) == 1,
+        p0=owned_vectors(mi.Point3f, corners[:, 0] - faces.centre),
+        e1=owned_vectors(mi.Vector3f, faces.e1[face]),
+        e2=owned_vectors(mi.Vector3f, faces.e2[face]),
+        normal=owned_vectors(mi.Vector3f, faces.normal[face] * sign),
+        area=owned(mi.Float, faces.area[face]),
+        reflectance=owned_vectors(mi.Color3f, materials.rho[back, face]),
+        emission=owned_vectors(mi.Color3f, np.where(emits, lights.exitance[face], 0)),
+        total_area=float(faces.area[face].sum()),
+        origin=mi.Point3f(*(dr.opaque(mi.Float, c) for c in faces.centre)),
+        lift=dr.opaque(mi.Float, lift_of(faces)),
+        corners=[owned_vectors(mi.Point3f, corners[:, k].astype(np.float32)) for k in range(3)],
+    )
+
+
+def lift_of(faces) -> float:
+    """By how much rays must start off a surface, and what lies in one plane, m."""
+    return RAY_OFFSET * max(np.abs(faces.corners).max(), np.finfo(np.float32).tiny)
+
+
+def patch_table(faces, patches):
+    """The patch of every side 2 · face + (1 for the back), NONE where there is none (UInt32 [2 · faces])."""
+    face, back = np.argsort(faces.rank)[patches.sides // 2], patches.sides % 2
+    table = np.full(2 * len(faces), NONE, dtype=np.uint32)
+    table[2 * face + back] = np.arange(patches.count)
+    return owned(mi.UInt32, table)

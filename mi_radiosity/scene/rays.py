@@ -1,0 +1,89 @@
+"""Rays between patches: where they end, what they miss, and the kernel F along them."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import NONE, owned_vectors
+from ..core.points import cosine_direction
+from .patches import patch_table
+
+
+@dataclass
+class Hit:
+    """Where rays end. ``patch`` is NONE on the sides of faces that take no part in light transport."""
+
+    valid: "mi.Bool"  # [rays] something was hit
+    patch: "mi.UInt32"  # [rays]
+    u: "mi.Float"  # [rays] barycentric coordinates on the face
+    v: "mi.Float"
+
+
+class Rays:
+    """Visibility in a scene, in the words of its patches."""
+
+    def __init__(self, faces, patches, overlaps=None):
+        self.scene, self.patches = faces.tracing, patches
+        self._first_face = faces.first_face
+        self._front = owned_vectors(mi.Vector3f, faces.normal)
+        self._patch_of = patch_table(faces, patches)
+        self.overlaps = overlaps
+
+    def leave(self, patch, u, v, s, t):
+        """Origin and cosine-distributed direction of rays that leave patches at (u, v) (Point3f, Vector3f [n])."""
+        p = self.patches
+        return p.above(patch, u, v) + p.origin, cosine_direction(dr.gather(mi.Vector3f, p.normal, patch), s, t)
+
+    def trace(self, origin, direction, active=True) -> Hit:
+        """Nearest hits of rays (Point3f, Vector3f [rays])."""
+        prelim = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+        return self.locate(prelim, direction)
+
+    def locate(self, prelim, direction) -> Hit:
+        """Name the patches that intersections lie on."""
+        valid = prelim.is_valid()
+        face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
+        back = dr.dot(dr.gather(mi.Vector3f, self._front, face, valid), direction) > 0
+        u, v = prelim.prim_uv.x, prelim.prim_uv.y
+        if self.overlaps:
+            face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
+        patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v)
+
+    def on_top(self, patch, u, v):
+        """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""
+        every = dr.full(mi.Bool, True, dr.width(u))
+        if not self.overlaps:
+            return every
+        face, back = dr.gather(mi.UInt32, self.patches.face, patch), dr.gather(mi.Bool, self.patches.back, patch)
+        owner, of_back, _, _ = self.overlaps.owner(face, back, u, v, every)
+        return (owner == face) & (of_back == back)
+
+    def blocked(self, a, b, active=True):
+        """Does anything lie between points a and b, relative to the origin of the patches (Bool [n])?"""
+        ray = mi.Ray3f(a + self.patches.origin, b - a)
+        ray.maxt = 1 - 1e-5
+        return self.scene.ray_test(ray, active=active)
+
+    def kernel(self, i, ui, vi, j, uj, vj):
+        """F(x, y) = V(x, y) cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n]).
+
+        0 where the points see each other's back, or lie under another face.
+        """
+        n_i = dr.gather(mi.Vector3f, self.patches.normal, i)
+        return self.kernel_at(self.patches.point(i, ui, vi), n_i, j, uj, vj, self.on_top(i, ui, vi))
+
+    def kernel_at(self, x, normal, j, uj, vj, active=True):
+        """F(x, y) between any points x, relative to the origin, with their normals, and points of patches (Float [n]).
+
+        Evaluated as unnormalised cosines over r⁴.
+        """
+        p = self.patches
+        n_j, y = dr.gather(mi.Vector3f, p.normal, j), p.point(j, uj, vj)
+        d = y - x
+        r2 = dr.squared_norm(d)
+        cosines = dr.maximum(dr.dot(normal, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
+        faces = (cosines > 0) & (r2 > 0) & active & self.on_top(j, uj, vj)
+        seen = faces & ~self.blocked(x + normal * p.lift, y + n_j * p.lift, faces)
+        return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)

@@ -1,0 +1,72 @@
+"""Model only what a scene needs: which sides of faces exchange light with a lamp, directly or over others."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import NONE, components, owned
+from ..core.points import ROUNDS, Stream, kronecker, stream_seed, triangle
+
+PROBES = 32  # rays per side that look for light
+LAMP_PROBES = 1 << 16  # rays from all lamps together
+
+
+def reached(rays, lights):
+    """Which patches can light reach (bool [patches])?
+
+    Every patch casts PROBES rays and the lamps LAMP_PROBES; light spreads along them, in both
+    directions, until nothing new is reached. As rays hardly find lamps that are small or seen at
+    a grazing angle, every patch draws PROBES lines to lamps as well.
+    """
+    patches = rays.patches
+    emits = np.array(dr.max(patches.emission) > 0).astype(bool)
+    source = np.repeat(np.arange(patches.count), PROBES)
+    target = _cast(rays, source, np.tile(np.arange(PROBES), patches.count))
+    links = [(source, target)]
+    if emits.any():
+        links += [_from_lamps(rays, np.flatnonzero(emits)), _towards_lamps(rays, np.flatnonzero(emits))]
+    source, target = np.concatenate([a for a, _ in links]), np.concatenate([b for _, b in links])
+    source, target = source[target != NONE], target[target != NONE]
+    lit = emits | np.isin(np.arange(patches.count), _from_free(rays, lights))
+    label = components(patches.count, source, target)
+    return np.isin(label, label[lit])
+
+
+def _cast(rays, patch, number):
+    """Patches that cosine-distributed rays from patches meet, NONE for none (int [n])."""
+    patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
+    u, v, s, t = kronecker(number, patch, dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH)))
+    return np.array(rays.trace(*rays.leave(patch, *triangle(u, v), s, t)).patch)
+
+
+def _from_lamps(rays, lamps):
+    """Links of lamps to what their rays meet."""
+    each = -(-LAMP_PROBES // len(lamps))
+    source = np.repeat(lamps, each)
+    return source, _cast(rays, source, np.tile(np.arange(each), len(lamps)))
+
+
+def _towards_lamps(rays, lamps):
+    """Links of lamps to patches that see them, each more than rounding above the plane of the other."""
+    p = rays.patches
+    index = dr.arange(mi.UInt32, p.count * PROBES)
+    patch, line = index // PROBES, index % PROBES
+    lot = mi.sample_tea_32(index, 0, ROUNDS)[0] % dr.opaque(mi.UInt32, len(lamps))
+    lamp = dr.gather(mi.UInt32, owned(mi.UInt32, lamps), lot)
+    x0, x1, y0, y1 = kronecker(line, patch, dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH, 1)))
+    x, y = triangle(x0, x1), triangle(y0, y1)
+    d = p.point(lamp, *y) - p.point(patch, *x)
+    here, there = dr.gather(mi.Vector3f, p.normal, patch), dr.gather(mi.Vector3f, p.normal, lamp)
+    above = (dr.dot(here, d) > p.lift) & (-dr.dot(there, d) > p.lift)
+    sees = np.array(above & (rays.kernel(patch, *x, lamp, *y) > 0)).astype(bool)
+    return np.array(lamp)[sees], np.array(patch)[sees]
+
+
+def _from_free(rays, lights):
+    """Patches that rays of lamps that are no surfaces meet (int [n])."""
+    met = [np.zeros(0, dtype=np.int64)]
+    for light in lights.free:
+        n = dr.arange(mi.UInt32, LAMP_PROBES // len(lights.free))
+        origin, direction, _ = light.shoot(*kronecker(n, dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)))
+        met.append(np.array(rays.trace(origin, direction).patch))
+    return np.concatenate(met)

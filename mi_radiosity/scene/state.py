@@ -1,0 +1,60 @@
+"""What a scene is like: to notice that it has been edited."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.errors import RadiosityError
+
+
+class State:
+    """The parameters of a scene's shapes, materials and lamps at one moment; cameras may move.
+
+    Keeps Dr.Jit's variables, so that a comparison costs no look at their contents unless they were replaced.
+    """
+
+    def __init__(self, scene):
+        self._shapes = [shape.ptr for shape in scene.shapes()]
+        self._parameters = _parameters(scene)
+
+    def same_as(self, scene) -> bool:
+        """Is ``scene`` as it was?"""
+        if self._shapes != [shape.ptr for shape in scene.shapes()]:
+            return False
+        now = _parameters(scene)
+        return now.keys() == self._parameters.keys() and all(
+            _equal(value, now[name]) for name, value in self._parameters.items()
+        )
+
+
+def refuse_gradients(scene) -> None:
+    """Raise RadiosityError if a parameter of the scene asks for gradients: a solution has none."""
+    for (_, name), value in _parameters(scene).items():
+        if dr.is_array_v(value) and dr.grad_enabled(value):
+            raise RadiosityError(
+                f"'{name}' asks for gradients, which a radiosity solution does not have yet: use 'prb'"
+            )
+
+
+def _parameters(scene):
+    """{(number, name): value} of everything that decides what is solved."""
+    things = [*scene.shapes(), *scene.emitters()]
+    return {
+        (number, f"{thing.id() or number}.{name}"): value
+        for number, thing in enumerate(things)
+        for name, value in mi.traverse(thing)
+    }
+
+
+def _equal(a, b):
+    if not dr.is_array_v(a) or not dr.is_array_v(b):
+        return a is b or a == b
+    if type(a) is not type(b) or dr.shape(a) != dr.shape(b):
+        return False
+    return _indices(a) == _indices(b) or bool(dr.all(a == b, axis=None))
+
+
+def _indices(value):
+    """Numbers of the variables behind an array."""
+    if dr.is_tensor_v(value):
+        return [value.array.index]
+    return [value.index] if dr.depth_v(value) == 1 else [part.index for part in value]

@@ -1,0 +1,31 @@
+"""Who receives the power of a ray: the pair tree, or the leaf the ray meets."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import NONE
+
+
+def pair_of(problem, batch, hit):
+    """The pair without children that each ray belongs to, NONE before its root exists (UInt32 [rays])."""
+    on_patch = (hit.patch != NONE) & (batch.patch != NONE)
+    pair = problem.pairs.find_roots(hit.patch, batch.patch, on_patch)
+    return problem.pairs.descend(pair, hit.u, hit.v, batch.u, batch.v, pair != NONE)
+
+
+def spread(problem, hit, pair):
+    """Over the receiver of the pair, or all of the patch, whatever stands between: smooth, for pilots (UInt32 [rays])."""
+    known = pair != NONE
+    return dr.select(known, dr.gather(mi.UInt32, problem.pairs.receiver, pair, known), hit.patch)
+
+
+def trusted(problem, hit, pair):
+    """Over the receiver of a pair that the oracle has seen in full view, else to the leaf the ray meets (UInt32 [rays]).
+
+    Spreading it over a receiver that something hides a part of, or that a wall crosses, would let light through.
+    """
+    pairs, known = problem.pairs, pair != NONE
+    receiver = spread(problem, hit, pair)
+    in_view = dr.gather(mi.Bool, pairs.asked, pair, known) & ~dr.gather(mi.Bool, pairs.occluded, pair, known)
+    spreads = known & in_view & ~dr.gather(mi.Bool, problem.exposure.crossed, receiver, known)
+    return problem.elements.leaf_at(receiver, hit.u, hit.v, (hit.patch != NONE) & ~spreads)

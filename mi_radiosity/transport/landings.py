@@ -1,0 +1,61 @@
+"""Where light came down on leaves that a wall crosses: it is sent on, and shown, from there."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import owned
+from ..core.points import hash_pair
+
+SEATS = 16  # points kept per leaf; a power of two
+
+
+class Landings:
+    """SEATS points of each of ``slots`` crossed leaves where rays met them, drawn at random (a reservoir).
+
+    u, v: patch coordinates (Float [slots · SEATS]), NaN where no light came down.
+    """
+
+    def __init__(self, slots, u=None, v=None):
+        self.slots = slots
+        nowhere = dr.full(mi.Float, dr.nan, SEATS * slots)
+        self.u, self.v = (mi.Float(nowhere) if x is None else owned(mi.Float, x) for x in (u, v))
+        self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * slots)
+
+    def offer(self, slot, u, v, number, active):
+        """Rays of a ``number`` each (UInt32 [n]) meet the points (u, v) of crossed leaves."""
+        if self.slots == 0:
+            return
+        dr.eval(slot, u, v, active)  # lest the rays be traced again
+        offer = dr.compress(active)
+        if dr.width(offer) == 0:
+            return
+        # The least of well mixed numbers: any of them, but the same on any number of threads.
+        lot = hash_pair(dr.gather(mi.UInt32, number, offer), 0)
+        seat = SEATS * dr.gather(mi.UInt32, slot, offer) + lot % SEATS
+        lot = (mi.UInt64(lot) << 32) | mi.UInt64(dr.gather(mi.UInt32, number, offer))
+        dr.scatter_reduce(dr.ReduceOp.Min, self._least, lot, seat, mode=dr.ReduceMode.Direct)
+        drawn = dr.gather(mi.UInt64, self._least, seat) == lot
+        for points, x in ((self.u, u), (self.v, v)):
+            dr.scatter(points, dr.gather(mi.Float, x, offer), seat, drawn)
+        dr.eval(self.u, self.v)
+
+    def settled(self):
+        """These landings, seats that were left empty shared with those that were not."""
+        if self.slots == 0:
+            return self
+        k = dr.arange(mi.UInt32, SEATS * self.slots)
+        result, step = Landings(self.slots, self.u, self.v), 1
+        while step < SEATS:
+            other = (k & ~mi.UInt32(SEATS - 1)) | ((k + step) & (SEATS - 1))
+            result.u, result.v = (
+                dr.select(dr.isnan(x), dr.gather(mi.Float, x, other), x) for x in (result.u, result.v)
+            )
+            dr.eval(result.u, result.v)
+            step *= 2
+        return result
+
+    def points(self, slot, number, active=True):
+        """Patch points of crossed leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light came
+        down (two Float [n])."""
+        seat = SEATS * slot + number % SEATS
+        return tuple(dr.gather(mi.Float, x, seat, active) for x in (self.u, self.v))

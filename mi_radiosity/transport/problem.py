@@ -1,0 +1,52 @@
+"""What a transport is given, and what it leaves behind."""
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from ..mesh import Elements, Exposure, Pairs
+from ..scene import Model
+from .landings import Landings
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A scene, a mesh of it, and who exchanges power with whom; all of it finished."""
+
+    model: Model
+    elements: Elements
+    pairs: Pairs
+    exposure: Exposure
+
+
+@dataclass
+class Record:
+    """Rays that met a patch, to discover pairs with: from source (j, uj, vj) to receiver (i, ui, vi)."""
+
+    i: "mi.UInt32"
+    ui: "mi.Float"
+    vi: "mi.Float"
+    j: "mi.UInt32"
+    uj: "mi.Float"
+    vj: "mi.Float"
+    pair: "mi.UInt32"  # where each ray stands in the pair tree, NONE before its root exists
+
+
+@dataclass(frozen=True)
+class Flow:
+    """What one transport did. Power in W per channel, irradiance in W/m².
+
+    ``direct`` and ``indirect`` are Color3f [elements]: right at the leaves, area averages at their ancestors.
+    """
+
+    direct: "mi.Color3f"
+    indirect: "mi.Color3f"
+    landings: Landings  # where light came down on leaves that a wall crosses
+    rays: int
+    iterations: int
+    first_share: float  # of the power shot in all, the lamps' part
+    emitted: list[float]
+    escaped: list[float]
+    blocked: list[float]  # absorbed by sides that reflect nothing
+    unshot: list[float]
+    records: tuple[Record, ...] = ()
