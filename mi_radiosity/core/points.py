@@ -15,7 +15,9 @@ ROUNDS = 8  # of the hash: with Mitsuba's 4, the numbers of neighbouring keys an
 STEPS = tuple(round(_PHI ** -(d + 1) * 2**32) for d in range(4))
 
 
-def kronecker(index, key, seed, owner=None):
+def kronecker(
+    index: "mi.UInt32", key: "mi.UInt32", seed: "mi.UInt32", owner: "mi.UInt32 | None" = None
+) -> "tuple[mi.Float, ...]":
     """Four uniform numbers in [0, 1) per entry: point ``index`` of the sequence shifted by ``key``.
 
     index: UInt32 [n]; seed: UInt32 (use an opaque literal); key: UInt32 [n] or one for all; or, with
@@ -29,17 +31,17 @@ def kronecker(index, key, seed, owner=None):
     return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0**-24 for shift, step in zip(shifts, STEPS))
 
 
-def hash_pair(a, b):
+def hash_pair(a: "mi.UInt32", b: "mi.UInt32") -> "mi.UInt32":
     """One well mixed number from two (UInt32 [n])."""
     return mi.sample_tea_32(a, b, ROUNDS)[0]
 
 
-def triangle(u, v):
+def triangle(u: "mi.Float", v: "mi.Float") -> "tuple[mi.Float, mi.Float]":
     """Uniform barycentric coordinates (Float u, Float v) of a triangle from two uniform numbers."""
     point = mi.warp.square_to_uniform_triangle(mi.Point2f(u, v))
     return point.x, point.y
 
 
-def cosine_direction(normal, u, v):
+def cosine_direction(normal: "mi.Vector3f", u: "mi.Float", v: "mi.Float") -> "mi.Vector3f":
     """Cosine-distributed unit direction about ``normal`` (Vector3f [n])."""
     return mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))

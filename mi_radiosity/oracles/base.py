@@ -25,8 +25,8 @@ class Pair:
     total_area: float  # A_T of all patches, m²
     level_receiver: "mi.UInt32"  # how often i and j were split from their patches [pairs]
     level_source: "mi.UInt32"
-    rho: "mi.Color3f | None" = None  # ρ_i [pairs]
-    B: "mi.Color3f | None" = None  # B_j known so far, emission included, W/m² [pairs]
+    rho: "mi.Color3f" = None  # ρ_i [pairs]
+    B: "mi.Color3f" = None  # B_j known so far, emission included, W/m² [pairs]
 
 
 class KernelSamples:
@@ -75,7 +75,7 @@ class Oracle:
     alpha: float | None = None
     uses_lines = True
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             ORACLES.add(cls.name, cls)
