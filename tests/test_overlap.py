@@ -15,11 +15,7 @@ GRID = 2**24  # corners are multiples of 1/GRID: all arithmetic of the judge is 
 def found_pairs(corners, tolerance):
     """Pairs (f, g), f < g, of the faces [n, 3, 3] that the code says lie in one another."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area, every, none = (
-        np.linalg.norm(normal, axis=1) / 2,
-        np.ones((len(corners), 2), bool),
-        np.zeros((len(corners), 2)),
-    )
+    area, every = np.linalg.norm(normal, axis=1) / 2, np.ones((len(corners), 2), dtype=bool)
     normal /= 2 * area[:, None]
     overlaps = Overlaps(
         corners, normal, area, every[:, 0], np.arange(len(corners)), every, 0.0 * every, 0.0 * every, tolerance
