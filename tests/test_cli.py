@@ -8,6 +8,8 @@ import pytest
 
 from mi_radiosity.cli import main
 
+pytestmark = pytest.mark.fast
+
 BOX = "scenes_xml/box_furnace.xml"
 QUICK = ["--elements", "200", "--rays", "9000", "--spp", "1"]
 
@@ -141,7 +143,7 @@ def test_interrupt(tmp_path, monkeypatch, capsys):
 
 def test_interrupt_inside_a_loop_of_drjit(tmp_path, monkeypatch):
     """Dr.Jit wraps the interrupt in a RuntimeError; it still is one."""
-    from mi_radiosity.solver import elements
+    from mi_radiosity.mesh import elements
 
     def stop(*_):
         raise KeyboardInterrupt
