@@ -48,3 +48,18 @@ def test_there_are_snippets():
 def test_blocks_keep_their_lines_and_lower_their_budgets():
     text = "A\n```python\nsolve(elements=19_000,\n      rays=900, lines=20)\n```\nB\n```\nno Python\n```\n"
     assert script(text) == "\n\nsolve(elements=1500,\n      rays=900, lines=20)\n\n\n\n\n\n"
+
+
+def test_one_version():
+    """pyproject.toml, CITATION.cff, the package and the top of CHANGELOG.md name the same version."""
+    patterns = {
+        "pyproject.toml": r'^version = "(.+)"$',
+        "CITATION.cff": r"^version: (.+)$",
+        "CHANGELOG.md": r"^## \[(.+?)\]",
+        "mi_radiosity/__init__.py": r'^__version__ = "(.+)"$',
+    }
+    found = {
+        file: re.search(pattern, Path(file).read_text(encoding="utf-8"), re.MULTILINE)[1]
+        for file, pattern in patterns.items()
+    }
+    assert len(set(found.values())) == 1, found
