@@ -2,7 +2,7 @@
 
 from fractions import Fraction
 
-from mi_radiosity.scene.overlap import Overlaps
+from mi_radiosity.scene.overlap import coplanar_pairs
 
 import numpy as np
 import pytest
@@ -15,12 +15,9 @@ GRID = 2**24  # corners are multiples of 1/GRID: all arithmetic of the judge is 
 def found_pairs(corners, tolerance):
     """Pairs (f, g), f < g, of the faces [n, 3, 3] that the code says lie in one another."""
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area, every = np.linalg.norm(normal, axis=1) / 2, np.ones((len(corners), 2), dtype=bool)
-    normal /= 2 * area[:, None]
-    overlaps = Overlaps(
-        corners, normal, area, every[:, 0], np.arange(len(corners)), every, 0.0 * every, 0.0 * every, tolerance
-    )
-    return {(a, b) for a, b in zip(*overlaps._pairs(normal, area, every[:, 0])) if a < b}
+    length = np.linalg.norm(normal, axis=1)
+    pairs = coplanar_pairs(corners, normal / length[:, None], length / 2, np.ones(len(corners), dtype=bool), tolerance)
+    return {(int(f), int(g)) for f, g in zip(*pairs) if f < g}
 
 
 def cross(o, a, b):
