@@ -8,6 +8,8 @@ import pytest
 
 from mi_radiosity.cli import main
 
+pytestmark = pytest.mark.fast
+
 BOX = "scenes_xml/box_furnace.xml"
 QUICK = ["--elements", "200", "--rays", "9000", "--spp", "1"]
 

@@ -13,6 +13,8 @@ from mi_radiosity.core.arrays import NONE
 from mi_radiosity.core.points import kronecker, triangle
 from mi_radiosity.mesh import Pairs, Tree
 
+pytestmark = pytest.mark.fast
+
 A, B, OTHER = 0.1, 0.2, 0.3  # reflectances that name the two plates and what stands between
 C11 = {(1, 1): 0.19982489569838, (2, 1): 0.28587538485071, (0.5, 4): 0.1985885560012}
 C14 = {(1, 1): 0.2000437760754, (2, 1): 0.23285260279536, (0.5, 3): 0.053268159377407}

@@ -8,6 +8,8 @@ from scipy.spatial import cKDTree
 
 import mi_radiosity as mr
 
+pytestmark = pytest.mark.fast
+
 T = mi.ScalarTransform4f
 
 

@@ -8,6 +8,8 @@ from conftest import diffuse, lamp, rectangle, scene
 import mi_radiosity as mr
 from mi_radiosity.scene import Model, inspect
 
+pytestmark = pytest.mark.fast
+
 
 def over(floor):
     """``floor`` under a lamp at z = 1."""

@@ -1,6 +1,7 @@
 """Small array tools: searching, drawing, and sums that come out the same on any number of threads."""
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -28,12 +29,12 @@ def owned_vectors(kind, array):
     return kind(*(owned(mi.Float, column) for column in np.asarray(array).T))
 
 
-def opaque_index(value):
+def opaque_index(value: int) -> "mi.UInt32":
     """A UInt32 the compiler cannot see, so that another value does not mean another kernel."""
     return dr.opaque(mi.UInt32, value)
 
 
-def concat(*arrays):
+def concat(*arrays: "dr.ArrayBase") -> "dr.ArrayBase":
     """The arrays (of one type, Color3f too) end to end."""
     # dr.concat has the offsets in its kernels, and so compiles anew for every length.
     widths = [dr.width(a) for a in arrays]
@@ -45,7 +46,7 @@ def concat(*arrays):
     return result
 
 
-def unique(keys):
+def unique(keys: "mi.UInt64") -> "mi.UInt64":
     """Sorted keys without repetitions (UInt64)."""
     keys = dr.sort(keys)
     k = dr.arange(mi.UInt32, dr.width(keys))
@@ -56,14 +57,20 @@ def unique(keys):
     return keys
 
 
-def lower_bound(values, key, active=True):
+def lower_bound(values: "dr.ArrayBase", key: "dr.ArrayBase", active: "mi.Bool | bool" = True) -> "mi.UInt32":
     """First position k of sorted ``values`` with values[k] >= key, at most the last one (UInt32 [n])."""
     low = dr.zeros(mi.UInt32, dr.width(key))
     return lower_bound_within(values, key, low, low + opaque_index(dr.width(values) - 1), active)
 
 
 @dr.syntax
-def lower_bound_within(values, key, low, high, active=True):
+def lower_bound_within(
+    values: "dr.ArrayBase",
+    key: "dr.ArrayBase",
+    low: "mi.UInt32",
+    high: "mi.UInt32",
+    active: "mi.Bool | bool" = True,
+) -> "mi.UInt32":
     """`lower_bound` for entries whose position is known to be in [low, high] (UInt32 [n])."""
     # dr.binary_search unrolls, and so compiles anew whenever the table has doubled.
     low, high = mi.UInt32(low), mi.UInt32(high)
@@ -81,7 +88,7 @@ class ColorSums:
     No sum may exceed ``bound`` (three floats, one per channel).
     """
 
-    def __init__(self, bins, bound):
+    def __init__(self, bins: int, bound: Sequence[float]):
         self.bins = bins
         # Powers of two: a bound that differs in the last bit gives the same fixed point.
         self.unit = [power_of_two(b) * 2.0**-60 for b in bound]
@@ -89,30 +96,30 @@ class ColorSums:
         self._to_float = [dr.opaque(mi.Float64, u) for u in self.unit]
         self._sums = [dr.zeros(mi.Int64, bins) for _ in range(3)]
 
-    def add(self, color, index, active=True):
+    def add(self, color: "Sequence[dr.ArrayBase]", index: "mi.UInt32", active: "mi.Bool | bool" = True) -> None:
         """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n])."""
         # Dr.Jit's own choice, Expand, has the number of bins in the kernel.
         for sums, scale, value in zip(self._sums, self._to_fixed, color):
             dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active, mode=dr.ReduceMode.Direct)
 
-    def gather(self, index):
+    def gather(self, index: "mi.UInt32") -> "list[mi.Float64]":
         """The sums of bins ``index`` as three Float64 [n]."""
         return [mi.Float64(dr.gather(mi.Int64, sums, index)) * scale for sums, scale in zip(self._sums, self._to_float)]
 
-    def totals(self):
+    def totals(self) -> list[float]:
         """Sums over all bins, three Python floats."""
         return [t * u for t, u in zip(totals(self._sums), self.unit)]
 
 
-def totals(arrays):
+def totals(arrays: "Sequence[dr.ArrayBase]") -> list[float]:
     """Sums of several arrays, as Python floats, read in one go."""
     sums = [dr.sum(a) for a in arrays]
     dr.eval(sums)
     return [s[0] for s in sums]
 
 
-def power_of_two(value):
-    """The smallest power of two ≥ ``value`` (1 for 0): scales by it round nothing."""
+def power_of_two(value: float) -> float:
+    """The smallest power of two > ``value`` (1 for 0): scales by it round nothing."""
     return 2.0 ** (math.frexp(value)[1] if value > 0 else 0)
 
 

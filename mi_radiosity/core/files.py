@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from .errors import RadiosityError
 
 
 @contextmanager
-def writing(path):
+def writing(path: str | os.PathLike[str]) -> Iterator[str]:
     """Yield a temporary path beside ``path`` that takes its place if the body succeeds.
 
     Raises RadiosityError, naming the file, if it cannot be written.
@@ -31,7 +32,7 @@ def writing(path):
             os.unlink(temporary)
 
 
-def check_writable(path):
+def check_writable(path: str | os.PathLike[str]) -> None:
     """Raise RadiosityError now if ``path`` could not be written later."""
     path = Path(path)
     if path.is_dir():

@@ -8,6 +8,7 @@ import ctypes
 import importlib.metadata
 import os
 import sys
+from pathlib import Path
 
 from .errors import RadiosityError
 
@@ -21,7 +22,7 @@ def _files(pattern: str) -> list[str]:
         files = importlib.metadata.files(WHEEL) or []
     except importlib.metadata.PackageNotFoundError:
         return []
-    return sorted(str(f.locate().resolve()) for f in files if f.name.startswith(pattern))
+    return sorted(str(Path(f.locate()).resolve()) for f in files if f.name.startswith(pattern))
 
 
 def choose_llvm() -> None:

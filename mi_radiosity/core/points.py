@@ -25,9 +25,8 @@ class Stream(IntEnum):
     PILOT = 2  # rays that discover pairs; one stream each
     COVER = 3  # points that show what of a leaf is covered
     STARVED = 4  # lines and rays of leaves that gather
-    LAMPS = 5  # the choice of a lamp
-    REACH = 6  # rays that look for light while a scene is read
-    MEASURE = 7  # irradiance at points of the user's
+    REACH = 5  # rays that look for light while a scene is read
+    MEASURE = 6  # irradiance at points of the user's
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:
@@ -38,7 +37,9 @@ def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:
     return (mixed ^ (mixed >> 31)) & 0xFFFFFFFF
 
 
-def kronecker(index, key, seed, owner=None):
+def kronecker(
+    index: "mi.UInt32", key: "mi.UInt32", seed: "mi.UInt32", owner: "mi.UInt32 | None" = None
+) -> "tuple[mi.Float, ...]":
     """Four uniform numbers in [0, 1) per entry: point ``index`` of the sequence shifted by ``key``.
 
     index: UInt32 [n]; seed: UInt32 (use an opaque literal); key: UInt32 [n] or one for all; or, with
@@ -52,22 +53,22 @@ def kronecker(index, key, seed, owner=None):
     return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0**-24 for shift, step in zip(shifts, STEPS))
 
 
-def hash_pair(a, b):
+def hash_pair(a: "mi.UInt32", b: "mi.UInt32") -> "mi.UInt32":
     """One well mixed number from two (UInt32 [n])."""
     return mi.sample_tea_32(a, b, ROUNDS)[0]
 
 
-def uniform(key, seed):
+def uniform(key: "mi.UInt32", seed: "mi.UInt32") -> "mi.Float":
     """One uniform number in [0, 1) per key (Float [n])."""
     return mi.sample_tea_float32(key, seed, ROUNDS)
 
 
-def triangle(u, v):
+def triangle(u: "mi.Float", v: "mi.Float") -> "tuple[mi.Float, mi.Float]":
     """Uniform barycentric coordinates (Float u, Float v) of a triangle from two uniform numbers."""
     point = mi.warp.square_to_uniform_triangle(mi.Point2f(u, v))
     return point.x, point.y
 
 
-def cosine_direction(normal, u, v):
+def cosine_direction(normal: "mi.Vector3f", u: "mi.Float", v: "mi.Float") -> "mi.Vector3f":
     """Cosine-distributed unit direction about ``normal`` (Vector3f [n])."""
     return mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))

@@ -23,10 +23,10 @@ class Pair:
     area_receiver: "mi.Float64"  # A_i, m² [pairs]
     area_source: "mi.Float64"  # A_j, m² [pairs]
     total_area: float  # A_T of all patches, m²
-    level_receiver: "mi.UInt32 | None" = None  # how often i and j were split from their patches [pairs]
-    level_source: "mi.UInt32 | None" = None
-    rho: "mi.Color3f | None" = None  # ρ_i [pairs]
-    B: "mi.Color3f | None" = None  # B_j known so far, emission included, W/m² [pairs]
+    level_receiver: "mi.UInt32" = None  # how often i and j were split from their patches [pairs]
+    level_source: "mi.UInt32" = None
+    rho: "mi.Color3f" = None  # ρ_i [pairs]
+    B: "mi.Color3f" = None  # B_j known so far, emission included, W/m² [pairs]
 
 
 class KernelSamples:
@@ -75,7 +75,7 @@ class Oracle:
     alpha: float | None = None
     uses_lines = True
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             ORACLES.add(cls.name, cls)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
-from .base import KernelSamples, Oracle
+from .base import KernelSamples, Oracle, Pair
 
 NEAR_ONE = 2.0**-5  # |u − 1| below which φ_α is summed as a series
 TERMS = 9  # of the series: the first left out is below 1e-14 of the sum
@@ -44,7 +45,7 @@ def _series(d, alpha):
     return (1 + total) / 2
 
 
-def information_gap(F, alpha):
+def information_gap(F: KernelSamples | ArrayLike, alpha: float) -> "mi.Float64":
     """Loss of information by discretising pairs: δ_α/(1 − α) (eq. 15 with the factor of eq. 14).
 
         δ_α = (mean F)^α − mean F^α
@@ -58,15 +59,17 @@ def information_gap(F, alpha):
     Source: Rigau, Feixas, Sbert, "A generalised-mutual-information-based oracle for hierarchical radiosity".
     """
     alpha = _checked(alpha)
-    if not isinstance(F, KernelSamples):
+    if isinstance(F, KernelSamples):
+        samples = F
+    else:
         require_variant()
-        F = _samples(F)
-    if F.pairs == 0:
+        samples = _samples(F)
+    if samples.pairs == 0:
         return mi.Float64()
     alpha = dr.opaque(mi.Float64, alpha)
-    mean = F.mean()
+    mean = samples.mean()
     scale = dr.select(mean > 0, mean, 1)
-    gap = F.reduce(lambda a, b: a + b, lambda f: _phi(f / scale, (f - mean) / scale, alpha)) / F.lines
+    gap = samples.reduce(lambda a, b: a + b, lambda f: _phi(f / scale, (f - mean) / scale, alpha)) / samples.lines
     return dr.select(mean > 0, dr.exp(alpha * dr.log(scale)) * gap, 0)
 
 
@@ -101,14 +104,14 @@ class GMI(Oracle):
     alpha: float = 0.5
     name = "gmi"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         object.__setattr__(self, "alpha", _checked(self.alpha))
 
-    def sigma(self, samples, pair):
+    def sigma(self, samples: KernelSamples, pair: Pair) -> "mi.Float64":
         scale = dr.opaque(mi.Float64, pair.total_area ** (self.alpha - 2))
         return pair.area_receiver * pair.area_source * scale * information_gap(samples, self.alpha)
 
-    def __str__(self):
+    def __str__(self) -> str:
         return f"{self.name}:{self.alpha:g}"
 
 
@@ -123,5 +126,5 @@ class MI(GMI):
     alpha: float = field(default=1.0, init=False)
     name = "mi"
 
-    def __str__(self):
+    def __str__(self) -> str:
         return self.name

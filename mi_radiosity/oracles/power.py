@@ -1,6 +1,8 @@
 """Transported power."""
 
-from .base import Oracle
+import mitsuba as mi
+
+from .base import KernelSamples, Oracle, Pair
 
 
 class Power(Oracle):
@@ -12,5 +14,5 @@ class Power(Oracle):
 
     name = "power"
 
-    def sigma(self, samples, pair):
+    def sigma(self, samples: KernelSamples, pair: Pair) -> "mi.Float64":
         return samples.mean() * pair.area_receiver * pair.area_source

@@ -1,8 +1,9 @@
 """Kernel smoothness."""
 
 import drjit as dr
+import mitsuba as mi
 
-from .base import Oracle
+from .base import KernelSamples, Oracle, Pair
 
 
 class KS(Oracle):
@@ -14,6 +15,6 @@ class KS(Oracle):
 
     name = "ks"
 
-    def sigma(self, samples, pair):
+    def sigma(self, samples: KernelSamples, pair: Pair) -> "mi.Float64":
         mean = samples.mean()
         return dr.maximum(samples.max() - mean, mean - samples.min()) * pair.area_source

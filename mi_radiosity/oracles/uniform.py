@@ -1,8 +1,9 @@
 """The control: a mesh that knows nothing of the light."""
 
 import drjit as dr
+import mitsuba as mi
 
-from .base import Oracle
+from .base import KernelSamples, Oracle, Pair
 
 
 class Uniform(Oracle):
@@ -11,8 +12,8 @@ class Uniform(Oracle):
     name = "uniform"
     uses_lines = False
 
-    def sigma(self, samples, pair):
+    def sigma(self, samples: KernelSamples, pair: Pair) -> "mi.Float64":
         return dr.maximum(pair.area_receiver, pair.area_source)
 
-    def value(self, sigma, pair):
+    def value(self, sigma: "mi.Float", pair: Pair) -> "mi.Float":
         return sigma
