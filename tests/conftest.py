@@ -1,10 +1,10 @@
 import mi_radiosity  # chooses LLVM before drjit loads
+from mi_radiosity.mesh.exposure import is_covered
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from mi_radiosity.mesh.exposure import is_covered
 
 mi.set_variant("llvm_ad_rgb")
 mi.set_log_level(mi.LogLevel.Error)

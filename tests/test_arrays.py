@@ -75,7 +75,6 @@ def test_unique_of_equal_keys(n):
     assert np.array(unique(dr.full(mi.UInt64, 2**64 - 1, n))).tolist() == [2**64 - 1]
 
 
-@pytest.mark.xfail(raises=RuntimeError, strict=True, reason="Dr.Jit refuses arithmetic on arrays without entries")
 def test_unique_of_nothing():
     assert dr.width(unique(mi.UInt64())) == 0
 
@@ -103,7 +102,6 @@ def test_lower_bound_in_a_table_of_one(wanted, at):
     np.testing.assert_array_equal(np.array(lower_bound(mi.UInt32([5]), mi.UInt32(wanted))), at)
 
 
-@pytest.mark.xfail(raises=RuntimeError, strict=True, reason="Dr.Jit refuses arithmetic on arrays without entries")
 def test_lower_bound_of_nothing():
     assert dr.width(lower_bound(mi.UInt32([1, 2]), mi.UInt32())) == 0
 

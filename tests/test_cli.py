@@ -2,11 +2,11 @@
 
 import json
 
+from mi_radiosity.cli import main
+
 import mitsuba as mi
 import numpy as np
 import pytest
-
-from mi_radiosity.cli import main
 
 pytestmark = pytest.mark.fast
 
@@ -106,7 +106,7 @@ def test_definitions(tmp_path):
     ],
 )
 def test_errors_are_one_line(arguments, says, capsys, monkeypatch, tmp_path):
-    arguments = [str((tmp_path / a)) if a.startswith(("x.", "nowhere/")) else a for a in arguments]
+    arguments = [str(tmp_path / a) if a.startswith(("x.", "nowhere/")) else a for a in arguments]
     assert main(arguments) == 2
     message = capsys.readouterr().err
     assert says in message and message.count("\n") == 1 and message.startswith("mi-radiosity: error: ")

@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
+import mi_radiosity as mr
+from mi_radiosity.display import Field
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import border_values, diffuse, gaps_between_leaves, lamp, rectangle, scene
-
-import mi_radiosity as mr
-from mi_radiosity.display import Field
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,6 @@ import json
 import os
 from pathlib import Path
 
-import mitsuba as mi
-import numpy as np
-import pytest
-
 import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.evaluation import metrics
@@ -15,6 +11,10 @@ from mi_radiosity.evaluation.bench import crossing
 from mi_radiosity.evaluation.compare import Cell, InProcess, compare_oracles, run_cells
 from mi_radiosity.evaluation.reference import Reference, path_image, render_reference
 from mi_radiosity.evaluation.report import interval
+
+import mitsuba as mi
+import numpy as np
+import pytest
 
 BOX = "scenes_xml/box_furnace.xml"
 
@@ -263,7 +263,7 @@ def test_a_failing_cell_gets_one_more_try():
 
     def work(c):
         tries.append(c.seed)
-        if c.seed == 1 and tries.count(1) == 1 or c.seed == 2:
+        if (c.seed == 1 and tries.count(1) == 1) or c.seed == 2:
             raise OSError("gone")
         return c.seed
 

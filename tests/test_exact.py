@@ -1,5 +1,8 @@
 """Whole solutions against exact ones, a full-matrix solution, and Mitsuba's path integrator."""
 
+import mi_radiosity as mr
+from mi_radiosity.scene import Model
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,9 +21,6 @@ from conftest import (
     wall_means,
 )
 from scipy import stats
-
-import mi_radiosity as mr
-from mi_radiosity.scene import Model
 
 T = mi.ScalarTransform4f
 

@@ -7,15 +7,15 @@ import subprocess
 import sys
 import time
 
+import mi_radiosity as mr
+from mi_radiosity.evaluation.reference import Reference, render_reference
+from mi_radiosity.scene import Model
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import ORACLES
-
-import mi_radiosity as mr
-from mi_radiosity.evaluation.reference import Reference, render_reference
-from mi_radiosity.scene import Model
 
 SOLVE = """
 import mi_radiosity as mr, drjit as dr, mitsuba as mi, numpy as np, sys

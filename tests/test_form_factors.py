@@ -1,17 +1,17 @@
 """Form factors from the package's own kernel and rays against closed forms."""
 
+import mi_radiosity as mr
+from mi_radiosity.core.arrays import NONE
+from mi_radiosity.core.points import kronecker, triangle
+from mi_radiosity.mesh import Pairs, Tree
+from mi_radiosity.scene import Model
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import diffuse, group, icosphere, lamp, mesh, quad, scene
 from scipy import stats
-
-import mi_radiosity as mr
-from mi_radiosity.scene import Model
-from mi_radiosity.core.arrays import NONE
-from mi_radiosity.core.points import kronecker, triangle
-from mi_radiosity.mesh import Pairs, Tree
 
 pytestmark = pytest.mark.fast
 

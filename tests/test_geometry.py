@@ -1,5 +1,8 @@
 """Geometry that hurts: one scene per case, solved with every oracle."""
 
+import mi_radiosity as mr
+from mi_radiosity.scene import Model
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -17,9 +20,6 @@ from conftest import (
     rectangle,
     scene,
 )
-
-import mi_radiosity as mr
-from mi_radiosity.scene import Model
 
 T = mi.ScalarTransform4f
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])

@@ -1,11 +1,11 @@
 """information_gap, the kernel of every GMI oracle, against 60-digit arithmetic."""
 
+import mi_radiosity as mr
+
 import mitsuba as mi
 import mpmath
 import numpy as np
 import pytest
-
-import mi_radiosity as mr
 
 pytestmark = pytest.mark.fast
 

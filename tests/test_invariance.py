@@ -1,12 +1,12 @@
 """What must not change a solution, and what must change it in proportion."""
 
+import mi_radiosity as mr
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import diffuse, lamp, leaf_corners, rectangle, scene, wall_means
 from scipy.spatial import cKDTree
-
-import mi_radiosity as mr
 
 pytestmark = pytest.mark.fast
 

@@ -1,5 +1,9 @@
 """Three hundred random scenes and what must hold in all of them."""
 
+import mi_radiosity as mr
+from mi_radiosity.display import Field
+from mi_radiosity.scene import Model
+
 import mitsuba as mi
 import numpy as np
 from conftest import (
@@ -17,10 +21,6 @@ from conftest import (
 )
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-
-import mi_radiosity as mr
-from mi_radiosity.display import Field
-from mi_radiosity.scene import Model
 
 BALLS = {k: icosphere(k, inwards=False) for k in (0, 1)}
 

@@ -1,12 +1,12 @@
 """Patches: what is modelled, on which side, and what is refused by name."""
 
+import mi_radiosity as mr
+from mi_radiosity.scene import Model, inspect
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import diffuse, lamp, rectangle, scene
-
-import mi_radiosity as mr
-from mi_radiosity.scene import Model, inspect
 
 pytestmark = pytest.mark.fast
 

@@ -1,12 +1,12 @@
 """solve(): budgets, energy, determinism, closed solutions, oracles of one's own, refusals."""
 
+import mi_radiosity as mr
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import diffuse, lamp, leaf_values, partition, rectangle, scene
-
-import mi_radiosity as mr
 
 ORACLES = [mr.KS(), mr.MI(), mr.GMI(0.5), mr.GMI(1.5), mr.Power(), mr.Uniform()]
 

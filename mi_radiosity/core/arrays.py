@@ -48,6 +48,8 @@ def concat(*arrays: "dr.ArrayBase") -> "dr.ArrayBase":
 
 def unique(keys: "mi.UInt64") -> "mi.UInt64":
     """Sorted keys without repetitions (UInt64)."""
+    if dr.width(keys) == 0:
+        return keys
     keys = dr.sort(keys)
     k = dr.arange(mi.UInt32, dr.width(keys))
     keys = dr.gather(
@@ -60,6 +62,8 @@ def unique(keys: "mi.UInt64") -> "mi.UInt64":
 def lower_bound(values: "dr.ArrayBase", key: "dr.ArrayBase", active: "mi.Bool | bool" = True) -> "mi.UInt32":
     """First position k of sorted ``values`` with values[k] >= key, at most the last one (UInt32 [n])."""
     low = dr.zeros(mi.UInt32, dr.width(key))
+    if dr.width(key) == 0:
+        return low
     return lower_bound_within(values, key, low, low + opaque_index(dr.width(values) - 1), active)
 
 

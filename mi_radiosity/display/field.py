@@ -102,7 +102,9 @@ class Field:
 
         def look(found, k):
             u, v = landings.points(slot, k, active)
-            return found | (active & ~found & ~self._rays.blocked(x, e.patches.above(patch, u, v), active & ~found)), k + 1
+            return found | (
+                active & ~found & ~self._rays.blocked(x, e.patches.above(patch, u, v), active & ~found)
+            ), k + 1
 
         found = mi.Bool(active & False)
         return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]

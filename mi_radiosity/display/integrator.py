@@ -29,7 +29,6 @@ def _integrator_class():
 
         def __init__(self, props):
             super().__init__(props)
-            require_variant()
             self.shading = props.get("shading", "gouraud")
             SHADERS.find(self.shading)
             alpha = float(props.get("alpha")) if "alpha" in props else None
@@ -54,6 +53,7 @@ def _integrator_class():
 
         def prepare(self, scene):
             """The solution of ``scene``, solved now if there is none, or if the scene has been edited since."""
+            require_variant()
             if self.solution is not None and self.solution.model.state.same_as(scene):
                 return self.solution
             if self._given:

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..display import render
 from ..core.files import writing
+from ..display import render
 from ..scene import Model
 from ..solver import solve
 from .compare import cached_reference

@@ -148,8 +148,8 @@ class Pairs:
         """Pairs as the oracle sees them; with ``radiosity`` B (Color3f [elements]) as its rule of acceptance does."""
         e = self.elements
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
-        areas = [mi.Float64(dr.gather(mi.Float, e.area, k)) for k in (i, j)]
-        pair = Pair(*areas, e.patches.total_area, e.level(i), e.level(j))
+        area_i, area_j = (mi.Float64(dr.gather(mi.Float, e.area, k)) for k in (i, j))
+        pair = Pair(area_i, area_j, e.patches.total_area, e.level(i), e.level(j))
         if radiosity is None:
             return pair
         rho, B = dr.gather(mi.Color3f, e.reflectance, i), dr.gather(mi.Color3f, radiosity, j)

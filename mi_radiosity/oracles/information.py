@@ -59,11 +59,8 @@ def information_gap(F: KernelSamples | ArrayLike, alpha: float) -> "mi.Float64":
     Source: Rigau, Feixas, Sbert, "A generalised-mutual-information-based oracle for hierarchical radiosity".
     """
     alpha = _checked(alpha)
-    if isinstance(F, KernelSamples):
-        samples = F
-    else:
-        require_variant()
-        samples = _samples(F)
+    require_variant()
+    samples = F if isinstance(F, KernelSamples) else _samples(F)
     if samples.pairs == 0:
         return mi.Float64()
     alpha = dr.opaque(mi.Float64, alpha)

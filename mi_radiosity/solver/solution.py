@@ -121,7 +121,7 @@ class Solution:
             raise RadiosityError("the scene has been edited since it was solved: solve it again")
 
     def _gather(self, points, normals, samples, seed):
-        patches, rays = self.model.patches, self.model.rays
+        patches = self.model.patches
         gatherer = Gatherer(self.model, self.elements, self._reflected())
         each, n = opaque_index(samples), len(points)
         total, at_once = np.zeros((n, 3)), max(1, (1 << 22) // samples)

@@ -1,7 +1,6 @@
 """Where power ends: exact sums per element, and what escapes or is blocked."""
 
 import drjit as dr
-import mitsuba as mi
 
 from ..core.arrays import NONE, ColorSums, opaque_index
 
