@@ -11,6 +11,8 @@ from mi_radiosity.cli import main
 from mi_radiosity.evaluation import scenes
 from mi_radiosity.oracles import ORACLES
 
+pytestmark = pytest.mark.fast
+
 BOX = "scenes_xml/box_furnace.xml"
 QUICK = ["--elements", "200", "--rays", "9000", "--spp", "1"]
 

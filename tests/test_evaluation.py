@@ -54,11 +54,13 @@ PRINTED = [
 # ---- Metrics ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("error, decibel", PRINTED)
 def test_the_papers_own_numbers(error, decibel):
     assert metrics.psnr(error) == pytest.approx(decibel, abs=1.5e-3)
 
 
+@pytest.mark.fast
 def test_errors_by_hand():
     """One pixel black, one white; the image gets red of the white one wrong by all of it."""
     reference = np.array([[[0, 0, 0], [1, 1, 1.0]]])
@@ -70,6 +72,7 @@ def test_errors_by_hand():
     assert metrics.srgb(np.array([-1.0, 9.0])) == pytest.approx([0, 255])
 
 
+@pytest.mark.fast
 def test_the_references_noise_is_removed():
     """True error 5 under noise 6 in each half: the clean RMSE is 5, within three of its standard errors."""
 
@@ -85,6 +88,7 @@ def test_the_references_noise_is_removed():
     assert metrics.reference_noise(halves) == pytest.approx(18**0.5, rel=0.01)
 
 
+@pytest.mark.fast
 def test_the_stated_uncertainty_is_right():
     """Over 200 references, noise shared by channels and neighbours, the clean error scatters as said (χ², 99.9 %)."""
     from scipy.ndimage import uniform_filter
@@ -101,11 +105,13 @@ def test_the_stated_uncertainty_is_right():
     assert low < np.sum(np.square(scores)) < high
 
 
+@pytest.mark.fast
 def test_interval_is_students():
     mean, half = interval([1.0, 2.0, 3.0])
     assert (mean, half) == (2.0, pytest.approx(4.302653 / 3**0.5))
 
 
+@pytest.mark.fast
 def test_crossing_of_curves():
     def points(*pairs):
         return [{"seconds": t, "rmse_a_clean": e} for t, e in pairs]
@@ -179,6 +185,7 @@ def test_few_samples_have_the_mean_of_many(judge, tmp_path, monkeypatch):
     assert few.mean() == pytest.approx(many, rel=0.005)
 
 
+@pytest.mark.fast
 def test_reference_command(tmp_path, capsys):
     assert main(["reference", BOX, "-o", str(tmp_path / "ref.exr"), "--spp", "64"]) == 0
     assert "its own RMSE_a is" in capsys.readouterr().out
@@ -262,6 +269,7 @@ def test_refused_comparisons(options, says, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.fast
 def test_kept_results_that_do_not_fit(tmp_path):
     (tmp_path / "results.json").write_text("{")
     with pytest.raises(mr.RadiosityError, match="damaged"):
@@ -271,6 +279,7 @@ def test_kept_results_that_do_not_fit(tmp_path):
         compare_oracles(BOX, tmp_path, **QUICK)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("library", ["scipy", "matplotlib", "jinja2"])
 @pytest.mark.parametrize("command", ["compare", "bench"])
 def test_missing_libraries_are_named_before_anything_is_computed(command, library, tmp_path, monkeypatch, capsys):
@@ -285,6 +294,7 @@ def cell(seed, reference="none.exr"):
     return Cell(Study(scene_file(BOX), 200, 1000, 10, 1, "gouraud", (0,), (reference,)), "ks", seed)
 
 
+@pytest.mark.fast
 def test_a_failing_cell_gets_one_more_try():
     tries, finished = [], []
 
@@ -363,6 +373,7 @@ def made_up():
     return {"scene": "x.xml", "setting": setting, "versions": {}, "reference": kept, "rows": rows, "missing": {}}
 
 
+@pytest.mark.fast
 def test_the_report_says_who_wins_and_by_how_much():
     found = tables.report(made_up(), ["b", "a<b"])
     (verdict,) = found.verdicts
@@ -376,6 +387,7 @@ def test_the_report_says_who_wins_and_by_how_much():
     assert mesh**2 + noise**2 / MORE_RAYS == pytest.approx(4, rel=1e-3)
 
 
+@pytest.mark.fast
 def test_markdown_and_html_show_the_same_rows():
     found = tables.report(made_up(), ["b", "a<b"])
     text, shown = tables.markdown(found), page(found, b"png")
@@ -465,6 +477,7 @@ def test_bench_says_how_many_views_it_shows(bench):
     assert (folder / "error_time.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("options, says", [({"shading": "toon"}, "'toon'"), ({"plugins": ["none.py"]}, "none.py")])
 def test_refused_benchmarks(options, says, tmp_path):
     with pytest.raises(mr.RadiosityError, match=says):
