@@ -18,6 +18,7 @@ class Hit:
     patch: "mi.UInt32"  # [rays]
     u: "mi.Float"  # [rays] barycentric coordinates on the face
     v: "mi.Float"
+    back: "mi.Bool"  # [rays] the side they meet is the back of its face
 
 
 class Rays:
@@ -26,7 +27,7 @@ class Rays:
     def __init__(self, faces, patches, overlaps=None):
         self.scene, self.patches = faces.tracing, patches
         self._first_face = faces.first_face
-        self._front = owned_vectors(mi.Vector3f, faces.normal)
+        self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
 
@@ -44,12 +45,15 @@ class Rays:
         """Name the patches that intersections lie on."""
         valid = prelim.is_valid()
         face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
-        back = dr.dot(dr.gather(mi.Vector3f, self._front, face, valid), direction) > 0
-        u, v = prelim.prim_uv.x, prelim.prim_uv.y
+        back = dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
+        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid)
+
+    def side(self, face, back, u, v, valid) -> Hit:
+        """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
         patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        return Hit(valid, dr.select(valid, patch, NONE), u, v)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v, back)
 
     def on_top(self, patch, u, v):
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, Distribution, totals
-from ..core.points import triangle
+from ..core.points import cosine_direction, triangle
 
 
 class Gatherer:
@@ -24,12 +24,32 @@ class Gatherer:
         emission = dr.gather(mi.Color3f, patches.emission, self._lamps)
         power = mi.Float64(dr.sum(emission) * dr.gather(mi.Float, patches.area, self._lamps))
         self._choice = Distribution(power, totals([power])[0])
+        self._density = dr.zeros(mi.Float, patches.count)  # of points drawn on lamps, 1/m²
+        probability = self._choice.probability(dr.arange(mi.UInt32, dr.width(self._lamps)))
+        dr.scatter(self._density, mi.Float(probability / dr.gather(mi.Float, patches.area, self._lamps)), self._lamps)
+        dr.eval(self._density)
 
-    def direct(self, x, normal, lot, s, t, active=True):
-        """H from the lamps: E F / p along a line to a point of a lamp that ``lot`` draws by power (Color3f [n])."""
+    def irradiance(self, x, normal, a, b, s, t, lot):
+        """H from one line to the lamps (numbers ``a``, ``b``, ``lot`` in [0, 1)) and one cosine-distributed ray
+        (``s``, ``t``) (Color3f [n]).
+
+        Lamps are found by both; the balance heuristic (Veach 1997) weighs them, so that no estimate exceeds their
+        exitance however near they are.
+        """
+        patches = self._model.patches
+        hit = self._model.rays.trace(x + patches.origin + normal * patches.lift, cosine_direction(normal, s, t))
+        return self.direct(x, normal, lot, a, b, met=hit) + self.reflected(hit)
+
+    def direct(self, x, normal, lot, s, t, active=True, met=None):
+        """H from the lamps: E F / p along a line to a point of a lamp that ``lot`` draws by power (Color3f [n]).
+
+        With ``met``, where cosine-distributed rays from there end (Hit [n]): E F / (p + F) along both.
+        """
         total = mi.Color3f(0)
         if dr.width(self._lamps):
-            total += self._from_surfaces(x, normal, lot, s, t, active)
+            total += self._from_surfaces(x, normal, lot, s, t, active, met is not None)
+            if met is not None:
+                total += self._met(x, normal, met)
         for light in self._free:
             direction, distance, irradiance = light.sample(x + self._model.patches.origin, s, t)
             cosine = dr.dot(direction, normal)
@@ -39,17 +59,32 @@ class Gatherer:
             total += dr.select(lit & ~hidden, irradiance * cosine, 0)
         return total
 
-    def _from_surfaces(self, x, normal, lot, s, t, active):
+    def _from_surfaces(self, x, normal, lot, s, t, active, shared):
         patches = self._model.patches
         number = self._choice.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._choice.whole))
         lamp = dr.gather(mi.UInt32, self._lamps, number)
         F = self._model.rays.kernel_at(x, normal, lamp, *triangle(s, t), active)
-        weight = F * dr.gather(mi.Float, patches.area, lamp) / mi.Float(self._choice.probability(number))
-        return dr.gather(mi.Color3f, patches.emission, lamp) * weight
+        density = dr.gather(mi.Float, self._density, lamp)
+        return dr.gather(mi.Color3f, patches.emission, lamp) * (F / (density + F if shared else density))
+
+    def _met(self, x, normal, hit):
+        """E F / (p + F) of the lamps that cosine-distributed rays meet: their density over the lamp is F."""
+        patches, met = self._model.patches, hit.patch != NONE
+        density = dr.gather(mi.Float, self._density, hit.patch, met)
+        n = dr.gather(mi.Vector3f, patches.normal, hit.patch, met)
+        d = patches.point(dr.select(met, hit.patch, 0), hit.u, hit.v) - x
+        r2 = dr.squared_norm(d)
+        # Times π r⁴, so that nothing is divided by a small distance.
+        cosines = dr.maximum(dr.dot(normal, d), 0) * dr.maximum(-dr.dot(n, d), 0)
+        weight = dr.select(met & (density > 0), cosines / (density * (dr.pi * r2 * r2) + cosines), 0)
+        return dr.gather(mi.Color3f, patches.emission, hit.patch, met) * weight
 
     def indirect(self, origin, direction, active=True):
         """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n])."""
-        hit = self._model.rays.trace(origin, direction, active)
+        return self.reflected(self._model.rays.trace(origin, direction, active), active)
+
+    def reflected(self, hit, active=True):
+        """The reflected radiosity where rays end (Color3f [n])."""
         met = active & (hit.patch != NONE)
         leaf = self._elements.leaf_at(hit.patch, hit.u, hit.v, met)
         return dr.gather(mi.Color3f, self._reflected, leaf, met)
