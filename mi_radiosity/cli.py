@@ -121,7 +121,7 @@ def _solve_arguments(group):
 
 
 def _shading_argument(parser):
-    names = "gouraud, flat, mesh or a plugin's (default gouraud)"
+    names = "gouraud, flat, mesh, lux or a plugin's (default gouraud)"
     parser.add_argument("--shading", default="gouraud", metavar="NAME", help=names)
 
 
@@ -187,7 +187,7 @@ def _definition(text):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import write_image
+    from .display import SHADERS, write_image
 
     options = _solve_options(arguments)
     for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
@@ -202,6 +202,8 @@ def _render(arguments: argparse.Namespace) -> None:
             image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
             write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
+    if legend := SHADERS.find(arguments.shading).legend(solution):
+        print(legend)
     s = solution.stats
     print(
         f"{s['elements']:,} elements, {s['pairs']:,} pairs, {s['rays']:,} rays, {s['oracle_rays']:,} oracle rays, "
