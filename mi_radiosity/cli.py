@@ -3,27 +3,44 @@
 import argparse
 import json
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
 
+if TYPE_CHECKING:  # imported where they are used, so that --help is quick
+    import mitsuba as mi
+
+    from .evaluation.scenes import SceneFile
+    from .scene import Model
+    from .solver import Solution
+
 PROGRAM = "mi-radiosity"
 STAGES = {"refine": "Refining", "distribute": "Distributing power"}
+SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")
+
+Report = Callable[[str, int, int | None], None]
 
 
 class Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours."""
+
     def error(self, message):
         raise RadiosityError(f"{message}; see `{self.prog} --help`")
 
 
-def main(argv=None):
+def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 2 for what the user can mend, 130 after Ctrl-C."""
     try:
         arguments = _parser().parse_args(argv)
         with interruptible():
-            return arguments.command(arguments) or 0
+            _prepare(arguments)
+            arguments.command(arguments)
+        return 0
     except RadiosityError as error:
         print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -32,127 +49,121 @@ def main(argv=None):
         return 130
 
 
-def _parser():
+def _parser() -> Parser:
     parser = Parser(prog=PROGRAM, description="Hierarchical Monte Carlo radiosity for Mitsuba 3 scenes.")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-
-    render = commands.add_parser("render", help="solve a scene and write pictures of it")
-    _scene_arguments(render)
-    render.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        type=Path,
-        metavar="OUT.exr|.png",
-        help="picture; with several views the view's number is added to the name",
-    )
-    _solve_arguments(render)
-    render.add_argument("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
-    render.add_argument("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
-    render.add_argument("--shading", choices=("gouraud", "flat", "mesh"), default="gouraud")
-    render.add_argument("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
-    render.add_argument("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
-    render.add_argument("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")
-    render.set_defaults(command=_render)
-
-    reference = commands.add_parser("reference", help="path-trace a reference; resumes, never starts over")
-    _scene_arguments(reference)
-    reference.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        type=Path,
-        metavar="REF.exr",
-        help="with several views the view's number is added to the name",
-    )
-    reference.add_argument(
-        "--spp", type=_positive, default=1024, metavar="N", help="samples per pixel in all (default 1024)"
-    )
-    reference.add_argument("--view", default="0", metavar="K|all")
-    reference.add_argument("--seed", type=int, default=0, metavar="K")
-    reference.set_defaults(command=_reference)
-
-    compare = commands.add_parser("compare", help="compare oracles: error beside cost, against a path-traced reference")
-    _scene_arguments(compare)
-    compare.add_argument(
-        "-o",
-        "--output",
-        required=True,
-        type=Path,
-        metavar="DIR",
-        help="table.md, results.json, figure.png, report.html; an interrupted run goes on",
-    )
-    compare.add_argument(
-        "--oracles",
-        default=None,
-        metavar="LIST",
-        help="such as ks,gmi:1.5,mi,gmi:0.5 (default: the rows of the paper's table 1)",
-    )
-    compare.add_argument("--elements", type=_positive, default=19_000, metavar="N")
-    compare.add_argument("--rays", type=_positive, default=2_684_000, metavar="N")
-    compare.add_argument("--lines", type=_positive, default=10, metavar="S")
-    compare.add_argument("--seeds", type=_positive, default=5, metavar="N", help="repetitions (default 5)")
-    compare.add_argument("--view", default="all", metavar="K|all")
-    compare.add_argument(
-        "--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel of our pictures (default 64)"
-    )
-    compare.add_argument("--reference-spp", type=_positive, default=1024, metavar="N")
-    compare.add_argument(
-        "--questions",
-        default="mesh,rays,time,noise",
-        metavar="LIST",
-        help="which budgets are equal: mesh, rays, time; noise splits the error",
-    )
-    compare.add_argument(
-        "--scheduler", metavar="ADDRESS", help="run on the Dask cluster there (needs mi_radiosity[dask])"
-    )
-    compare.set_defaults(command=_compare)
-
-    bench = commands.add_parser("bench", help="error against time: ours, path, and path with a denoiser")
-    _scene_arguments(bench)
-    bench.add_argument("-o", "--output", required=True, type=Path, metavar="DIR", help="bench.json and error_time.png")
-    bench.add_argument(
-        "--elements", type=_positive, default=19_000, metavar="N", help="middle of the ladder of budgets"
-    )
-    bench.add_argument("--rays", type=_positive, default=2_684_000, metavar="N")
-    bench.add_argument("--view", default="0", metavar="K")
-    bench.add_argument("--views", type=_positive, default=16, metavar="N", help="views of the camera path (default 16)")
-    bench.add_argument("--reference-spp", type=_positive, default=1024, metavar="N")
-    bench.add_argument(
-        "--path-spp", type=_positive, default=1024, metavar="N", help="most samples per pixel of path (default 1024)"
-    )
-    bench.set_defaults(command=_bench)
-
-    info = commands.add_parser("info", help="say what of a scene would be modelled, what not and why")
-    _scene_arguments(info)
-    info.set_defaults(command=_info)
+    for add, run, text in (
+        (_render_arguments, _render, "solve a scene and write pictures of it"),
+        (_reference_arguments, _reference, "path-trace a reference; resumes, never starts over"),
+        (_compare_arguments, _compare, "compare oracles: error beside cost, against a path-traced reference"),
+        (_bench_arguments, _bench, "error against time: ours, path, and path with a denoiser"),
+        (lambda parser: None, _info, "say what of a scene would be modelled, what not and why"),
+    ):
+        command = commands.add_parser(run.__name__.strip("_"), help=text)
+        _scene_arguments(command)
+        add(command)
+        command.set_defaults(command=run)
     return parser
 
 
+# ---- Arguments -------------------------------------------------------------------------------------
+# Names of oracles and shaders are checked after parsing, when plugins have defined theirs.
+
+
 def _scene_arguments(parser):
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
-    parser.add_argument(
-        "-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)"
+    add = parser.add_argument
+    add("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
+    add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
+    add(
+        "-D",
+        "--define",
+        type=_definition,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="set a $KEY of the scene file",
     )
-    parser.add_argument(
-        "-D", "--define", action="append", default=[], metavar="KEY=VALUE", help="set a $KEY of the scene file"
+    add(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="MODULE|FILE.py",
+        help="Python code that defines oracles or shaders of your own; may be repeated",
     )
 
 
-def _solve_arguments(parser):
-    group = parser.add_argument_group("solution")
-    group.add_argument("--oracle", metavar="NAME", help="ks, mi, gmi, power or uniform (default gmi)")
-    group.add_argument("--alpha", type=float, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
-    group.add_argument(
-        "--elements",
-        type=_positive,
-        metavar="N",
-        help="leaf elements wanted (default: 19,000 more than the patches, or twice those)",
+def _render_arguments(parser):
+    add, names = parser.add_argument, "picture; with several views the view's number is added to the name"
+    add("-o", "--output", required=True, type=Path, metavar="OUT.exr|.png", help=names)
+    _solve_arguments(parser.add_argument_group("solution"))
+    add("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
+    add("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
+    _shading_argument(parser)
+    add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
+    add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
+    add("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")
+
+
+def _solve_arguments(group):
+    add = group.add_argument
+    add(
+        "--oracle",
+        metavar="NAME[:PARAMETER]",
+        help="ks, mi, gmi, power, uniform or a plugin's, such as gmi:0.75 (default gmi)",
     )
-    group.add_argument("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
-    group.add_argument("--rays", type=_positive, metavar="N", help="rays that carry power (default: 300 per element)")
-    group.add_argument("--lines", type=_positive, metavar="S", help="random lines per pair (default 10)")
-    group.add_argument("--seed", type=int, metavar="K", help="random seed (default 0)")
+    add("--alpha", type=float, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
+    wanted = "leaf elements wanted (default: 19,000 more than the patches, or twice those)"
+    add("--elements", type=_positive, metavar="N", help=wanted)
+    add("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
+    add("--rays", type=_positive, metavar="N", help="rays that carry power (default: 300 per element)")
+    add("--lines", type=_positive, metavar="S", help="random lines per pair (default 10)")
+    add("--seed", type=int, metavar="K", help="random seed (default 0)")
+
+
+def _shading_argument(parser):
+    names = "gouraud, flat, mesh or a plugin's (default gouraud)"
+    parser.add_argument("--shading", default="gouraud", metavar="NAME", help=names)
+
+
+def _reference_arguments(parser):
+    add, names = parser.add_argument, "with several views the view's number is added to the name"
+    add("-o", "--output", required=True, type=Path, metavar="REF.exr", help=names)
+    add("--spp", type=_positive, default=1024, metavar="N", help="samples per pixel in all (default 1024)")
+    add("--view", default="0", metavar="K|all")
+    add("--seed", type=int, default=0, metavar="K")
+
+
+def _budget_arguments(parser, elements, files):
+    add = parser.add_argument
+    add("-o", "--output", required=True, type=Path, metavar="DIR", help=files)
+    add("--elements", type=_positive, default=19_000, metavar="N", help=elements)
+    add("--rays", type=_positive, default=2_684_000, metavar="N")
+    add("--reference-spp", type=_positive, default=1024, metavar="N")
+    _shading_argument(parser)
+
+
+def _compare_arguments(parser):
+    add, files = parser.add_argument, "table.md, results.json, figure.png, report.html; an interrupted run goes on"
+    _budget_arguments(parser, "leaf elements of every mesh", files)
+    rows = "such as ks,gmi:1.5,mi,gmi:0.5 (default: the rows of the paper's table 1)"
+    add("--oracles", metavar="LIST", help=rows)
+    add("--lines", type=_positive, default=10, metavar="S")
+    add("--seeds", type=_positive, default=5, metavar="N", help="repetitions (default 5)")
+    add("--view", default="all", metavar="K|all")
+    samples = "camera samples per pixel of our pictures (default 64)"
+    add("--spp", type=_positive, default=64, metavar="N", help=samples)
+    equal = "which budgets are equal: mesh, rays, time; noise splits the error"
+    add("--questions", default="mesh,rays,time,noise", metavar="LIST", help=equal)
+    add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster there (needs mi_radiosity[dask])")
+
+
+def _bench_arguments(parser):
+    add = parser.add_argument
+    _budget_arguments(parser, "middle of the ladder of budgets", "bench.json and error_time.png")
+    add("--view", default="0", metavar="K")
+    add("--views", type=_positive, default=16, metavar="N", help="views of the camera path (default 16)")
+    most = "most samples per pixel of path (default 1024)"
+    add("--path-spp", type=_positive, default=1024, metavar="N", help=most)
 
 
 def _positive(text):
@@ -165,46 +176,31 @@ def _positive(text):
     return value
 
 
+def _definition(text):
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise argparse.ArgumentTypeError(f"write '{text}' as KEY=VALUE")
+    return key, value
+
+
 # ---- Commands --------------------------------------------------------------------------------------
 
 
-def _render(arguments):
-    from .display import render, write_image
-    from .oracles import make_oracle
-    from .solver import Solution, solve
+def _render(arguments: argparse.Namespace) -> None:
+    from .display import write_image
 
-    output = arguments.output
-    if output.suffix.lower() not in (".exr", ".png"):
-        raise RadiosityError(f"-o {output}: choose a name that ends in .exr or .png")
-    solving = {
-        name: value
-        for name in ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")
-        if (value := getattr(arguments, name)) is not None
-    }
-    if arguments.load and solving:
-        raise RadiosityError(f"--load shows a finished solution: leave out --{next(iter(solving))}")
-    solving["oracle"] = make_oracle(solving.pop("oracle", "gmi"), solving.pop("alpha", None))
-    for path in filter(None, (output, arguments.save, arguments.stats)):
+    options = _solve_options(arguments)
+    for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
         check_writable(path)
-
-    scene = load_scene(arguments)
+    scene = arguments.file.load()
     views = choose_views(scene, arguments.view)
     with progress_bars() as report:
-        solution = Solution.load(arguments.load, scene) if arguments.load else solve(scene, **solving, progress=report)
-        for warning in solution.model.warnings:
-            print(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
-        if arguments.save:
-            solution.save(arguments.save)
-        if arguments.stats:
-            with writing(arguments.stats) as temporary:
-                Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
+        solution = _solution(arguments, scene, options, report)
+        _keep(arguments, solution)
         for number, view in enumerate(views):
             report("render", number, len(views))
-            write_image(
-                view_name(output, view, views),
-                render(solution, view, spp=arguments.spp, shading=arguments.shading),
-                solution.stats,
-            )
+            image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
+            write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
     s = solution.stats
     print(
@@ -213,187 +209,194 @@ def _render(arguments):
     )
 
 
-def _reference(arguments):
+def _solve_options(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What `solve` is asked for; names and combinations are checked here, before anything takes time."""
+    from .oracles import make_oracle
+
+    if arguments.output.suffix.lower() not in (".exr", ".png"):
+        raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .exr or .png")
+    options = {name: value for name in SOLVING if (value := getattr(arguments, name)) is not None}
+    if arguments.load and options:
+        raise RadiosityError(f"--load shows a finished solution: leave out --{next(iter(options))}")
+    oracle = make_oracle(options.pop("oracle", "gmi"), options.pop("alpha", None))
+    return options | {"oracle": oracle}
+
+
+def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[str, Any], report: Report) -> "Solution":
+    """The solution of a scene, loaded or solved now, with its warnings on standard error."""
+    from .solver import Solution, solve
+
+    solution = Solution.load(arguments.load, scene) if arguments.load else solve(scene, **options, progress=report)
+    for warning in solution.model.warnings:
+        print(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
+    return solution
+
+
+def _keep(arguments: argparse.Namespace, solution: "Solution") -> None:
+    """Write what was asked for beside pictures."""
+    if arguments.save:
+        solution.save(arguments.save)
+    if arguments.stats:
+        with writing(arguments.stats) as temporary:
+            Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
+
+
+def _reference(arguments: argparse.Namespace) -> None:
     from .evaluation.reference import render_reference
 
     if arguments.output.suffix.lower() != ".exr":
         raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .exr")
     check_writable(arguments.output)
-    scene = load_scene(arguments)
+    scene = arguments.file.load()
     views = choose_views(scene, arguments.view)
     with progress_bars() as report:
         for view in views:
-            path = view_name(arguments.output, view, views)
+            path, stage = view_name(arguments.output, view, views), f"path tracing view {view}"
             result = render_reference(
                 scene,
                 scene.sensors()[view],
                 path,
                 arguments.spp,
                 arguments.seed,
-                lambda done, total, view=view: report(f"path tracing view {view}", done, total),
+                partial(report, stage),
             )
             print(f"{path}: {sum(result.spp)} samples per pixel, its own RMSE_a is {result.noise():.3f}")
 
 
-def _compare(arguments):
-    from .evaluation.compare import PAPER, QUESTIONS, compare_oracles
+def _compare(arguments: argparse.Namespace) -> None:
+    from .evaluation.compare import PAPER, compare_oracles
 
-    questions = arguments.questions.split(",")
-    if unknown := set(questions) - set(QUESTIONS):
-        raise RadiosityError(f"--questions {', '.join(unknown)}: choose from {', '.join(QUESTIONS)}")
-    if "mesh" not in questions:
-        raise RadiosityError("--questions: the others are measured against 'mesh', name it too")
-    scene = load_scene(arguments)
-    views = choose_views(scene, arguments.view)
-    make_folder(arguments.output)
+    views = choose_views(arguments.file.load(), arguments.view)
     with progress_bars() as report:
         compare_oracles(
-            arguments.scene,
-            arguments.output,
-            variant=arguments.mode,
-            definitions=tuple(parse_definitions(arguments.define).items()),
+            **_study(arguments, report),
             oracles=arguments.oracles or PAPER,
-            elements=arguments.elements,
-            rays=arguments.rays,
             lines=arguments.lines,
             seeds=arguments.seeds,
-            views=tuple(views),
+            views=views,
             spp=arguments.spp,
-            reference_spp=arguments.reference_spp,
-            questions=tuple(q for q in QUESTIONS if q in questions),
+            questions=arguments.questions.split(","),
             scheduler=arguments.scheduler,
-            progress=report,
         )
-    print((arguments.output / "table.md").read_text())
+    print((arguments.output / "table.md").read_text(encoding="utf-8"))
 
 
-def _bench(arguments):
+def _bench(arguments: argparse.Namespace) -> None:
     from .evaluation.bench import PATH_SPP, run_bench
+    from .evaluation.plots import panel_titles
 
-    scene = load_scene(arguments)
     if arguments.view == "all":
         raise RadiosityError("--view all: bench looks from one sensor, name its number")
-    (view,) = choose_views(scene, arguments.view)
-    make_folder(arguments.output)
+    (view,) = choose_views(arguments.file.load(), arguments.view)
     with progress_bars() as report:
         results = run_bench(
-            arguments.scene,
-            arguments.output,
-            elements=arguments.elements,
-            rays=arguments.rays,
+            **_study(arguments, report),
             view=view,
-            reference_spp=arguments.reference_spp,
-            path_spp=tuple(s for s in PATH_SPP if s <= arguments.path_spp),
+            path_spp=[s for s in PATH_SPP if s <= arguments.path_spp],
             views=arguments.views,
-            progress=report,
         )
     tracing = results["tracing"]
     print(
-        f"solve: {tracing['warm_seconds']:.2f} s warm, {tracing['cold_seconds']:.1f} s cold, {tracing['solve_over_tracing']:.2f} times tracing its rays, {tracing['peak_megabytes']:.0f} MB"
+        f"solve: {tracing['warm_seconds']:.2f} s warm, {tracing['cold_seconds']:.1f} s cold, "
+        f"{tracing['solve_over_tracing']:.2f} times tracing its rays, {tracing['peak_megabytes']:.0f} MB"
     )
-    for name, title in (("one", "one view"), ("many", f"{arguments.views} views")):
-        for other, where in results.get(name, {}).get("crossing", {}).items():
-            print(
-                f"{title}: RMSE_a {where['rmse_a']:.2f} takes us {where['ours_seconds']:.2f} s and {other} {where['other_seconds']:.2f} s; "
-                + (
-                    f"{other} is better from {where['seconds']:.1f} s on"
-                    if where["seconds"]
-                    else f"{other} is never better in the time measured"
-                )
-            )
+    for name, title in panel_titles(results).items():
+        for other, where in results[name]["crossing"].items():
+            print(f"{title}: {_crossing(other, where)}")
     print(arguments.output / "bench.json")
 
 
-def _info(arguments):
-    import drjit as dr
-    import mitsuba as mi
+def _study(arguments: argparse.Namespace, report: Report) -> dict[str, Any]:
+    """What `compare_oracles` and `run_bench` are both given."""
+    file: SceneFile = arguments.file
+    return {
+        "path": arguments.scene,
+        "output": arguments.output,
+        "variant": file.variant,
+        "definitions": dict(file.definitions),
+        "plugins": file.plugins,
+        "elements": arguments.elements,
+        "rays": arguments.rays,
+        "shading": arguments.shading,
+        "reference_spp": arguments.reference_spp,
+        "progress": report,
+    }
+
+
+def _crossing(other: str, where: dict[str, Any]) -> str:
+    """Where a curve crosses ours, as a sentence."""
+    later = f"from {where['seconds']:.1f} s on" if where["seconds"] else "never in the time measured"
+    return (
+        f"RMSE_a {where['rmse_a']:.2f} takes us {where['ours_seconds']:.2f} s and {other} "
+        f"{where['other_seconds']:.2f} s; {other} is better {later}"
+    )
+
+
+def _info(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
     from .scene import Model, inspect
 
-    scene = load_scene(arguments)
+    scene = arguments.file.load()
     console = Console()
-    findings = inspect(scene)
-    if findings:
-        table = Table("not modelled", "why", title=str(arguments.scene), title_justify="left")
+    title: dict[str, Any] = {"title": str(arguments.scene), "title_justify": "left"}
+    if findings := inspect(scene):
+        table = Table("not modelled", "why", **title)
         for finding in findings:
             table.add_row(finding.what, finding.why)
-        console.print(table)
-        return
-    model = Model(scene)
-    fronts = int((model.sides % 2 == 0).sum())
-    table = Table(title=str(arguments.scene), title_justify="left", show_header=False)
-    power = [dr.sum(e * model.area)[0] for e in model.emission]
-    lamps = int(dr.sum(dr.select(dr.max(model.emission) > 0, mi.UInt32(1), 0))[0])
-    for name, value in (
-        ("shapes", f"{len(scene.shapes()):,}"),
-        ("faces", f"{len(model.faces.shape):,}"),
-        ("patches", f"{model.count:,} ({fronts:,} fronts, {model.count - fronts:,} backs)"),
-        ("sides no light reaches", f"{model.unreached:,}, left out"),
-        ("area of patches", f"{model.total_area:.6g}"),
-        ("lamps", f"{lamps:,} patches, {power[0]:.4g}, {power[1]:.4g}, {power[2]:.4g} W"),
-        ("textured reflectance", "yes" if model.textured else "no"),
-        ("sensors", f"{len(scene.sensors())}"),
-        ("not modelled", "nothing: the whole scene is"),
-    ):
-        table.add_row(name, value)
-    for warning in model.warnings:
-        table.add_row("warning", warning)
+    else:
+        table = Table(**title, show_header=False)
+        for name, value in _facts(Model(scene)):
+            table.add_row(name, value)
     console.print(table)
+
+
+def _facts(model: "Model") -> Iterator[tuple[str, str]]:
+    """What there is to know of a scene before it is solved."""
+    import drjit as dr
+    import numpy as np
+
+    patches = model.patches
+    fronts = int((patches.sides % 2 == 0).sum())
+    power = [dr.sum(e * patches.area)[0] for e in patches.emission]
+    lamps = np.count_nonzero(np.array(dr.max(patches.emission)))
+    yield "shapes", f"{len(model.scene.shapes()):,}"
+    yield "faces", f"{len(model.faces.shape):,}"
+    yield "patches", f"{patches.count:,} ({fronts:,} fronts, {patches.count - fronts:,} backs)"
+    yield "sides no light reaches", f"{model.unreached:,}, left out"
+    yield "area of patches", f"{patches.total_area:.6g}"
+    yield "lamps", f"{lamps:,} patches, {power[0]:.4g}, {power[1]:.4g}, {power[2]:.4g} W"
+    yield "textured reflectance", "yes" if model.materials.textured else "no"
+    yield "sensors", f"{len(model.scene.sensors())}"
+    yield "not modelled", "nothing: the whole scene is"
+    for warning in model.warnings:
+        yield "warning", warning
 
 
 # ---- What commands share ---------------------------------------------------------------------------
 
 
-def load_scene(arguments):
-    """The Mitsuba scene of the command line, in the variant asked for."""
+def _prepare(arguments: argparse.Namespace) -> None:
+    """Choose the variant, load plugins, and check the names they may have added to."""
     import mitsuba as mi
 
-    if arguments.mode not in mi.variants():
-        raise RadiosityError(f"unknown variant '{arguments.mode}': choose one of {', '.join(mi.variants())}")
-    if not arguments.scene.is_file():
-        raise RadiosityError(f"the scene {arguments.scene} does not exist: check the path")
-    definitions = parse_definitions(arguments.define)
-    from .scene.model import require_variant
+    from .display import SHADERS
+    from .evaluation.scenes import scene_file
 
     mi.set_log_level(mi.LogLevel.Error)
-    mi.set_variant(arguments.mode)
-    require_variant()
-    try:
-        scene = mi.load_file(str(arguments.scene), optimize=False, **definitions)  # unmerged shapes keep their names
-    except RuntimeError as error:
-        raise RadiosityError(f"Mitsuba cannot read {arguments.scene}: {error}") from None
-    if not isinstance(scene, mi.Scene):
-        raise RadiosityError(f"{arguments.scene} holds no <scene>: give a scene file")
-    return scene
+    arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
+    arguments.file.prepare()
+    if "shading" in arguments:
+        SHADERS.find(arguments.shading)
 
 
-def make_folder(path):
-    """Make a folder for output, or say why not."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RadiosityError(f"cannot write into {path} ({error.strerror}): choose another folder") from None
-
-
-def parse_definitions(texts):
-    """-D options as {key: value}."""
-    definitions = {}
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals or not key:
-            raise RadiosityError(f"-D {text}: write it as KEY=VALUE")
-        definitions[key] = value
-    return definitions
-
-
-def view_name(path, view, views):
+def view_name(path: Path, view: int, views: Sequence[int]) -> Path:
     """``path`` itself, or with the number of the view if there are several."""
     return path if len(views) == 1 else path.with_name(f"{path.stem}_{view}{path.suffix}")
 
 
-def choose_views(scene, text):
+def choose_views(scene: "mi.Scene", text: str) -> list[int]:
     """Sensor numbers meant by --view."""
     count = len(scene.sensors())
     if count == 0:
@@ -408,13 +411,13 @@ def choose_views(scene, text):
 
 
 @contextmanager
-def progress_bars():
+def progress_bars() -> Iterator[Report]:
     """Yield report(stage, done, total), which draws one bar per stage on standard error."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    tasks = {}
+    tasks: dict[str, Any] = {}
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
 
         def report(stage, done, total):

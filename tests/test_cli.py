@@ -1,12 +1,15 @@
 """The command line: files, exit statuses, one line for every error."""
 
 import json
-
-from mi_radiosity.cli import main
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
 import pytest
+
+from mi_radiosity.cli import main
+from mi_radiosity.evaluation import scenes
+from mi_radiosity.oracles import ORACLES
 
 pytestmark = pytest.mark.fast
 
@@ -42,25 +45,8 @@ def test_render_writes_what_it_is_asked_for(tmp_path, capsys):
 
 
 def test_all_views(tmp_path):
-    assert (
-        main(
-            [
-                "render",
-                "scenes_xml/office.xml",
-                "-o",
-                str(tmp_path / "office.png"),
-                "--view",
-                "all",
-                "--elements",
-                "1500",
-                "--rays",
-                "50000",
-                "--spp",
-                "1",
-            ]
-        )
-        == 0
-    )
+    arguments = ["render", "scenes_xml/office.xml", "-o", str(tmp_path / "office.png"), "--view", "all"]
+    assert main([*arguments, "--elements", "1500", "--rays", "50000", "--spp", "1"]) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["office_0.png", "office_1.png"]
 
 
@@ -95,7 +81,14 @@ def test_definitions(tmp_path):
         (["render", BOX, "-o", "x.png", "--elements", "0"], "greater than 0"),
         (["render", BOX, "-o", "x.png", "--elements", "3"], "at least 12"),
         (["render", BOX, "-o", "x.png", "--rays", "many"], "not a whole number"),
-        (["render", BOX, "-o", "x.png", "--shading", "toon"], "shading"),
+        (["render", BOX, "-o", "x.png", "--oracle", "gmi:x"], "must be a number"),
+        (["render", BOX, "-o", "x.png", "--oracle", "ks:2"], "no parameter"),
+        (["render", BOX, "-o", "x.png", "--oracle", "gmi:0.5", "--alpha", "1"], "no alpha"),
+        (["render", BOX, "-o", "x.png", "--shading", "toon"], "'toon': choose one of gouraud, flat, mesh"),
+        (["compare", BOX, "-o", "x.d", "--shading", "toon"], "'toon': choose one of gouraud, flat, mesh"),
+        (["bench", BOX, "-o", "x.d", "--shading", "toon"], "'toon': choose one of gouraud, flat, mesh"),
+        (["info", BOX, "--plugin", "x.py"], "x.py does not exist"),
+        (["info", BOX, "--plugin", "no_such_module"], "no plugin module no_such_module"),
         (["render", BOX, "-o", "x.png", "--frobnicate"], "frobnicate"),
         (["render", BOX, "-o", "x.png", "--load", "none.npz"], "none.npz does not exist"),
         (["render", BOX, "-o", "x.png", "--load", "none.npz", "--rays", "9"], "leave out --rays"),
@@ -141,12 +134,68 @@ def test_interrupt(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == [] and "interrupted" in capsys.readouterr().err
 
 
-def test_interrupt_inside_a_loop_of_drjit(tmp_path, monkeypatch):
+PLUGIN = """
+import drjit as dr
+import mitsuba as mi
+import mi_radiosity as mr
+
+class Brightest(mr.Oracle):
+    name = "brightest"
+    def __init__(self, power=1.0):
+        self.power = power
+    def sigma(self, samples, pair):
+        return pair.area_receiver * pair.area_source * samples.max() ** self.power
+    def __str__(self):
+        return f"{self.name}:{self.power:g}"
+
+class Impatient(mr.Oracle):
+    name = "impatient"
+    uses_lines = False
+    def sigma(self, samples, pair):
+        def body(i):
+            raise KeyboardInterrupt
+        dr.while_loop((mi.UInt32(0),), lambda i: i < 1, body)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path):
+    file = tmp_path / "oracles.py"
+    file.write_text(PLUGIN)
+    yield file
+    for name in ("brightest", "impatient"):
+        ORACLES.pop(name, None)
+
+
+def test_interrupt_inside_a_loop_of_drjit(tmp_path, plugin):
     """Dr.Jit wraps the interrupt in a RuntimeError; it still is one."""
-    from mi_radiosity.mesh import elements
+    arguments = ["render", BOX, "-o", str(tmp_path / "x.png"), "--plugin", str(plugin), "--oracle", "impatient"]
+    assert main([*arguments, *QUICK]) == 130
 
-    def stop(*_):
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(elements, "child_at", stop)
-    assert main(["render", BOX, "-o", str(tmp_path / "x.png"), *QUICK]) == 130
+def test_oracle_with_its_parameter(tmp_path, plugin):
+    """NAME:PARAMETER means what --alpha does, and holds for oracles of a plugin."""
+
+    def stats(*options):
+        file = tmp_path / "stats.json"
+        assert main(["render", BOX, "-o", str(tmp_path / "x.png"), "--stats", str(file), *QUICK, *options]) == 0
+        return {name: value for name, value in json.loads(file.read_text()).items() if name != "seconds"}
+
+    colon = stats("--oracle", "gmi:0.75")
+    assert (colon["oracle"], colon["alpha"]) == ("gmi", 0.75)
+    assert colon == stats("--oracle", "gmi", "--alpha", "0.75") == stats("--alpha", "0.75")
+    assert stats("--plugin", str(plugin), "--oracle", "brightest:2")["oracle"] == "brightest"
+
+
+def test_plugins_of_installed_packages(tmp_path, plugin, monkeypatch):
+    """What a package declares as entry point is known without --plugin."""
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [SimpleNamespace(value=str(plugin))])
+    scenes._run_plugins.cache_clear()
+    assert main(["render", BOX, "-o", str(tmp_path / "x.png"), "--oracle", "brightest", *QUICK]) == 0
+
+
+def test_help_needs_no_scene(capsys):
+    for command in ("render", "reference", "compare", "bench", "info"):
+        with pytest.raises(SystemExit) as end:
+            main([command, "--help"])
+        assert end.value.code == 0 and "--plugin" in capsys.readouterr().out

@@ -3,157 +3,159 @@
 import json
 import math
 import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.files import writing
-from ..display import render
+from ..display import SHADERS
 from ..scene import Model
 from ..solver import solve
-from .compare import cached_reference
+from . import require_extra
 from .metrics import compare
-from .reference import path_image, versions
+from .plots import error_against_time
+from .records import make_folder, write
+from .reference import cached_reference, path_image, versions
+from .scenes import scene_file
 from .speed import measure
 
 LADDER = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2, 4)  # of the budgets given
 PATH_SPP = (1, 4, 16, 64, 256, 1024)
 VIEWS = 16
+OUR_SPP = 16  # camera samples per pixel of our pictures
 SWEEP = 45  # degrees the camera path turns through
-NAMES = {"ours": "radiosity", "path": "path", "denoised": "path + Open Image Denoise"}
 
 
-@dataclass
+@dataclass(frozen=True)
 class Views:
     """Sensors with their references: one view, or a camera path."""
 
-    sensors: list
-    halves: list
+    sensors: list["mi.Sensor"]
+    halves: list[np.ndarray]
 
-    def error(self, images):
-        """RMSE_a over all views, the references' noise removed, and with it."""
-        errors = [compare(image, halves) for image, halves in zip(images, self.halves)]
-
-        def mean(name):
-            return float(np.mean([getattr(e, name) ** 2 for e in errors]) ** 0.5)
-
+    def error(self, images: Iterable[np.ndarray]) -> dict[str, float]:
+        """RMSE_a over all views, with the references' noise and without, and relMSE."""
+        errors = [compare(image, halves) for image, halves in zip(images, self.halves, strict=True)]
         return {
-            "rmse_a": mean("rmse_a"),
-            "rmse_a_clean": mean("rmse_a_clean"),
+            "rmse_a": float(np.mean([e.rmse_a**2 for e in errors]) ** 0.5),
+            "rmse_a_clean": float(np.mean([e.rmse_a_clean**2 for e in errors]) ** 0.5),
             "rel_mse": float(np.mean([e.rel_mse for e in errors])),
         }
 
 
 def run_bench(
-    path,
-    output,
+    path: str | Path,
+    output: str | Path,
     *,
-    elements=19_000,
-    rays=2_684_000,
-    view=0,
-    reference_spp=1024,
-    path_spp=PATH_SPP,
-    views=VIEWS,
-    runs=5,
-    progress=lambda stage, done, total: None,
-):
-    """Write bench.json and error_time.png of a scene file into ``output``; returns the results (dict).
+    variant: str | None = None,
+    definitions: Mapping[str, str] | None = None,
+    plugins: Iterable[str] = (),
+    elements: int = 19_000,
+    rays: int = 2_684_000,
+    view: int = 0,
+    shading: str = "gouraud",
+    reference_spp: int = 1024,
+    path_spp: Sequence[int] = PATH_SPP,
+    views: int = VIEWS,
+    runs: int = 5,
+    progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Write bench.json and error_time.png of a scene file into ``output``; returns the results.
 
     Ours is solve + pictures for a ladder of budgets with kernels warm. ``path`` runs at 1…1024 samples
     per pixel; the denoiser, where mitsuba-oidn is installed, gets albedo and normals too. The camera
     path turns the first sensor about its place, at half the resolution and a quarter of the samples.
     """
-    output = Path(output)
-    scene = mi.load_file(str(path), optimize=False)
-    model = Model(scene)
-    reference, _ = cached_reference(model, scene, view, output, reference_spp, progress)
-    one = Views([scene.sensors()[view]], [reference.halves()])
+    require_extra()
+    output, file = Path(output), scene_file(path, variant, definitions, plugins)
+    file.prepare()
+    SHADERS.find(shading)
+    make_folder(output)
+    model = file.model()
+    reference, _ = cached_reference(model, view, output, reference_spp, progress)
     results = {
         "scene": Path(path).name,
         "versions": versions(),
         "elements": elements,
         "rays": rays,
+        "shading": shading,
+        "views": views,
         "spp": reference_spp,
         "reference_noise": reference.noise(),
-        "tracing": measure(path, elements, rays, runs),
+        "tracing": measure(file, elements, rays, runs),
     }
-    results["one"] = _curves(model, scene, one, elements, rays, path_spp, "one view", progress)
-    turning = _camera_path(scene, view, views)
-    if turning:
-        halves = []
-        for number, sensor in enumerate(turning):
-            halves.append(
-                np.stack(
-                    [
-                        path_image(scene, sensor, max(reference_spp // 8, 1), seed=(1000 + number, 2000 + number)[half])
-                        for half in range(2)
-                    ]
-                )
-            )
-            progress("references of the camera path", number + 1, len(turning))
+    attempts = partial(_attempts, model, elements, rays, shading)
+    one = Views([model.scene.sensors()[view]], [reference.halves()])
+    results["one"] = _curves(attempts(path_spp), one, partial(progress, "measuring one view"))
+    if many := _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress):
         fewer = [s for s in path_spp if s <= max(path_spp[-1] // 16, path_spp[0])]
-        results["many"] = _curves(
-            model, scene, Views(turning, halves), elements, rays, fewer, f"{views} views", progress
-        )
-    for name in ("one", "many"):
-        if name in results:
-            results[name]["crossing"] = {
-                other: crossing(results[name]["ours"], results[name][other])
-                for other in ("path", "denoised")
-                if other in results[name]
-            }
-    with writing(output / "bench.json") as temporary:
-        Path(temporary).write_text(json.dumps(results, indent=1) + "\n")
-    _plot(results, output / "error_time.png")
+        results["many"] = _curves(attempts(fewer), many, partial(progress, f"measuring {views} views"))
+    write(output / "bench.json", json.dumps(results, indent=1) + "\n")
+    write(output / "error_time.png", error_against_time(results))
     return results
 
 
-def _curves(model, scene, views, elements, rays, path_spp, stage, progress):
-    """Measured points {"ours": [...], "path": [...], "denoised": [...]} for some views."""
-    denoise = _denoiser()
-    ladder = [(max(model.count, round(elements * f)), round(rays * f)) for f in LADDER]
-    total = len(ladder) + len(path_spp) * (2 if denoise else 1)
-    curves = {"ours": [], "path": []} | ({"denoised": []} if denoise else {})
-    done = 0
-
-    def note(curve, seconds, images, **more):
-        nonlocal done
-        curves[curve].append({"seconds": seconds, **more, **views.error(images)})
-        done += 1
-        progress(f"measuring {stage}", done, total)
-
-    def pictures(solution):
-        return [np.array(render(solution, s, spp=16))[..., :3] for s in views.sensors]
-
-    pictures(solve(model, elements=ladder[0][0], rays=ladder[0][1]))  # compiles
-    for n, r in ladder:
-        start = _now()
-        solution = solve(model, elements=n, rays=r)
-        solved = _now()
-        images = pictures(solution)
-        note("ours", _now() - start, images, elements=solution.stats["elements"], rays=r, solve_seconds=solved - start)
-    path_image(scene, views.sensors[0], 1)
-    for spp in path_spp:
-        start = _now()
-        images = [path_image(scene, s, spp) for s in views.sensors]
-        note("path", _now() - start, images, spp=spp)
-    for spp in path_spp if denoise else ():
-        denoise(scene, views.sensors[0], 1)
-        start = _now()
-        images = [denoise(scene, s, spp) for s in views.sensors]
-        note("denoised", _now() - start, images, spp=spp)
-    return curves
+# ---- Curves ----------------------------------------------------------------------------------------
 
 
-def _now():
+def _attempts(
+    model: Model, elements: int, rays: int, shading: str, path_spp: Sequence[int]
+) -> dict[str, list[Callable[[list["mi.Sensor"]], tuple[list[np.ndarray], dict[str, Any]]]]]:
+    """By curve: what takes sensors and returns their pictures, and what else is known of them."""
+    ladder = [(max(model.patches.count, round(elements * f)), round(rays * f)) for f in LADDER]
+    tracers = {"path": path_image} | ({"denoised": denoise} if (denoise := _denoiser()) else {})
+    return {"ours": [partial(_solved, model, shading, *budget) for budget in ladder]} | {
+        curve: [partial(_traced, trace, model.scene, spp) for spp in path_spp] for curve, trace in tracers.items()
+    }
+
+
+def _curves(attempts: dict[str, list[Callable]], views: Views, progress: Callable[[int, int], None]) -> dict[str, Any]:
+    """Measured points of every curve, and where the others cross ours."""
+    done, total = 0, sum(map(len, attempts.values()))
+    curves: dict[str, Any] = {}
+    for curve, tries in attempts.items():
+        for attempt in tries[:2]:  # compiles: `path` has one kernel for one sample per pixel and one for more
+            attempt(views.sensors)
+        curves[curve] = []
+        for attempt in tries:
+            curves[curve].append(_timed(attempt, views))
+            done += 1
+            progress(done, total)
+    others = [curve for curve in curves if curve != "ours"]
+    return curves | {"crossing": {other: crossing(curves["ours"], curves[other]) for other in others}}
+
+
+def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
+    """One point of a curve: seconds and errors of an attempt at pictures of the views."""
+    start = _now()
+    images, more = attempt(views.sensors)
+    return {"seconds": _now() - start, **more, **views.error(images)}
+
+
+def _solved(model, shading, elements, rays, sensors):
+    """Our pictures, and what the solution took."""
+    start = _now()
+    solution = solve(model, elements=elements, rays=rays)
+    more = {"elements": solution.stats["elements"], "rays": rays, "solve_seconds": _now() - start}
+    return [np.array(solution.render(s, spp=OUR_SPP, shading=shading))[..., :3] for s in sensors], more
+
+
+def _traced(trace, scene, spp, sensors):
+    """Pictures by a path tracer."""
+    return [trace(scene, sensor, spp) for sensor in sensors], {"spp": spp}
+
+
+def _now() -> float:
     dr.sync_thread()
     return time.perf_counter()
 
 
-def _denoiser():
+def _denoiser() -> Callable[["mi.Scene", "mi.Sensor", int], np.ndarray] | None:
     """denoise(scene, sensor, spp) with albedo and normals, or None where mitsuba-oidn is not installed."""
     try:
         import mitsuba_oidn
@@ -164,48 +166,13 @@ def _denoiser():
         color = path_image(scene, sensor, spp)
         features = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
         planes = np.array(mi.render(scene, sensor=sensor, integrator=features, spp=min(spp, 16), seed=spp))
-        albedo, normal = (
-            np.ascontiguousarray(planes[..., -6 + 3 * k : planes.shape[2] - 3 + 3 * k], dtype=np.float32)
-            for k in range(2)
-        )
+        albedo, normal = np.ascontiguousarray(np.split(planes[..., -6:], 2, axis=2), dtype=np.float32)
         return np.array(mitsuba_oidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True))
 
     return run
 
 
-def _camera_path(scene, view, count):
-    """``count`` sensors that turn about the place of a perspective sensor, at half its resolution ([] for others)."""
-    sensor = scene.sensors()[view]
-    if sensor.class_name() != "PerspectiveCamera":
-        return []
-    width, height = (max(int(n) // 2, 8) for n in sensor.film().crop_size())
-    to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-    place, up = to_world[:3, 3], to_world[:3, 1]
-    sensors = []
-    for angle in np.linspace(-SWEEP / 2, SWEEP / 2, count):
-        turn = mi.ScalarTransform4f().translate(place).rotate(up, angle).translate(-place)
-        sensors.append(
-            mi.load_dict(
-                {
-                    "type": "perspective",
-                    "fov": float(mi.traverse(sensor)["x_fov"][0]),
-                    "fov_axis": "x",
-                    "to_world": turn @ mi.ScalarTransform4f(to_world),
-                    "film": {
-                        "type": "hdrfilm",
-                        "width": width,
-                        "height": height,
-                        "pixel_format": "rgb",
-                        "component_format": "float32",
-                        "rfilter": {"type": "gaussian"},
-                    },
-                }
-            )
-        )
-    return sensors
-
-
-def crossing(ours, other):
+def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
     """Where another curve becomes better than ours, points joined by straight lines in log-log.
 
     {"seconds": time from which the other is better (None if never within the times both were
@@ -219,7 +186,7 @@ def crossing(ours, other):
     (t, e), (u, f) = curve(ours), curve(other)
     times = np.linspace(max(t[0], u[0]), max(t[-1], u[-1]), 2000)
     behind = np.flatnonzero(np.interp(times, u, f) >= np.interp(times, t, e))
-    first = behind[-1] + 1 if len(behind) else 0
+    first = int(behind[-1]) + 1 if len(behind) else 0
     both = max(e[-1], f[-1])
     return {
         "seconds": math.exp(times[first]) if first < len(times) else None,
@@ -229,23 +196,37 @@ def crossing(ours, other):
     }
 
 
-def _plot(results, file):
-    from .report import _matplotlib, _png
+# ---- Camera path -----------------------------------------------------------------------------------
 
-    panels = [(name, title) for name, title in (("one", "one view"), ("many", f"{VIEWS} views")) if name in results]
-    figure, axes = _matplotlib().subplots(
-        1, len(panels), figsize=(6.5 * len(panels), 4.6), squeeze=False, layout="constrained"
+
+def _camera_path(
+    scene: "mi.Scene", view: int, count: int, spp: int, progress: Callable[[str, int, int], None]
+) -> Views | None:
+    """Views of a perspective sensor that turns about its place, with two halves of ``spp`` samples each."""
+    sensor = scene.sensors()[view]
+    if sensor.class_name() != "PerspectiveCamera":
+        return None
+    sensors = [_turned(sensor, angle) for angle in np.linspace(-SWEEP / 2, SWEEP / 2, count)]
+    halves = []
+    for number, turned in enumerate(sensors):
+        halves.append(np.stack([path_image(scene, turned, spp, seed=start + number) for start in (1000, 2000)]))
+        progress("references of the camera path", number + 1, count)
+    return Views(sensors, halves)
+
+
+def _turned(sensor: "mi.Sensor", angle: float) -> "mi.Sensor":
+    """A perspective sensor at half its resolution, turned by ``angle`` degrees about its own up direction."""
+    to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    place, up = to_world[:3, 3], to_world[:3, 1]
+    turn = mi.ScalarTransform4f().translate(place).rotate(up, angle).translate(-place)
+    width, height = (max(int(n) // 2, 8) for n in sensor.film().crop_size())
+    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32"}
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": float(mi.traverse(sensor)["x_fov"][0]),
+            "fov_axis": "x",
+            "to_world": turn @ mi.ScalarTransform4f(to_world),
+            "film": film | {"rfilter": {"type": "gaussian"}},
+        }
     )
-    for axis, (name, title) in zip(axes[0], panels):
-        for curve, label in NAMES.items():
-            if points := results[name].get(curve):
-                axis.loglog([p["seconds"] for p in points], [p["rmse_a_clean"] for p in points], "o-", label=label)
-        axis.set(
-            title=f"{results['scene']}: {title}",
-            xlabel="seconds (solve and render, kernels warm)",
-            ylabel="RMSE_a (0…255), reference noise removed",
-        )
-        axis.grid(True, which="both", alpha=0.25)
-        axis.legend()
-    with writing(file) as temporary:
-        Path(temporary).write_bytes(_png(figure))

@@ -1,35 +1,38 @@
 """How far an image is from a reference that is noisy itself."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+EQUAL = (1 / 3, 1 / 3, 1 / 3)
 PERCEPTUAL = (0.2126, 0.7152, 0.0722)  # Rec. 709 luminance, as in sRGB
 LAGS = 3  # pixels over which a reconstruction filter correlates noise
 
 
-def srgb(image):
+def srgb(image: ArrayLike) -> np.ndarray:
     """Linear radiance ─► 0…255 sRGB-encoded, clipped but not rounded (float64)."""
     x = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
     return 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def mean_square(difference, weights=(1 / 3, 1 / 3, 1 / 3)):
+def mean_square(difference: np.ndarray, weights: Sequence[float] = EQUAL) -> float:
     """Mean over pixels of the weighted squares of [height, width, 3] differences."""
     return float((difference**2 @ np.asarray(weights)).mean())
 
 
-def rmse(a, b, weights=(1 / 3, 1 / 3, 1 / 3)):
+def rmse(a: ArrayLike, b: ArrayLike, weights: Sequence[float] = EQUAL) -> float:
     """Root mean square error of two linear images, measured as 8-bit sRGB (0…255)."""
     return mean_square(srgb(a) - srgb(b), weights) ** 0.5
 
 
-def psnr(error):
+def psnr(error: float) -> float:
     """Peak signal-to-noise ratio of an RMSE: 20 log10(255 / RMSE), in dB."""
     return float(20 * np.log10(255 / error)) if error > 0 else float("inf")
 
 
-def relative_error(image, reference):
+def relative_error(image: ArrayLike, reference: ArrayLike) -> float:
     """relMSE, linear, for HDR: mean of (x − r)² / (r² + 0.01)."""
     x, r = np.asarray(image, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     return float(((x - r) ** 2 / (r**2 + 0.01)).mean())
@@ -48,11 +51,11 @@ class Errors:
     rmse_a_clean: float
     rmse_a_clean_error: float
 
-    def asdict(self):
+    def asdict(self) -> dict[str, float]:
         return asdict(self)
 
 
-def compare(image, halves):
+def compare(image: ArrayLike, halves: np.ndarray) -> Errors:
     """Errors of ``image`` against a reference in two independent halves ([2, height, width, 3], linear).
 
     With x the image, r₀ and r₁ the halves, all sRGB-encoded, the mean of (x − r₀)(x − r₁) is
@@ -78,7 +81,7 @@ def compare(image, halves):
     )
 
 
-def _sum_of_neighbours(q):
+def _sum_of_neighbours(q: np.ndarray) -> float:
     """Σ q(p) q(p + lag) over pixels p and all lags within LAGS."""
     padded = np.pad(q, LAGS)
     height, width = q.shape
@@ -91,6 +94,6 @@ def _sum_of_neighbours(q):
     )
 
 
-def reference_noise(halves):
+def reference_noise(halves: np.ndarray) -> float:
     """RMSE_a of a reference itself, estimated from its halves: half the RMSE between them."""
     return rmse(halves[0], halves[1]) / 2
