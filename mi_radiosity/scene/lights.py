@@ -48,6 +48,12 @@ class Light:
         of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
 
+    def fingerprint(self) -> bytes:
+        """What tells it from other lamps: all parameters of the emitter."""
+        values = {name: getattr(value, "matrix", value) for name, value in mi.traverse(self.emitter)}
+        parts = [name.encode() + np.array(value, dtype=np.float32).tobytes() for name, value in sorted(values.items())]
+        return b"".join([self.emitter.class_name().encode(), *parts])
+
 
 class Area(Light):
     """Mitsuba's `area` with a constant radiance L_e."""
