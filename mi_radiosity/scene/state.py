@@ -40,7 +40,7 @@ def _parameters(scene):
     """{(number, name): value} of everything that decides what is solved."""
     things = [*scene.shapes(), *scene.emitters()]
     return {
-        (number, f"{thing.id() or number}.{name}"): value
+        (number, f"{thing.id() or number}.{name}"): type(value)(value)  # Mitsuba's own would change with the scene
         for number, thing in enumerate(things)
         for name, value in mi.traverse(thing)
     }
