@@ -183,10 +183,10 @@ def test_lux_by_channel():
 
 
 def test_irradiance_in_a_white_furnace():
-    """H = E / (1 − ρ) anywhere inside, whatever the normal."""
+    """H = E / (1 − ρ) anywhere inside, whatever the normal, to what such a mesh is good for."""
     furnace = mr.solve(
         scene(box={"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5), "emitter": lamp()}),
-        elements=300,
+        elements=2000,
         rays=2_000_000,
     )
     random = np.random.default_rng(1)
@@ -259,7 +259,7 @@ def test_an_edited_scene_is_solved_anew(edit):
     before = np.array(mi.render(edited, integrator=plugin, spp=4))
     solution = mr.solve(edited, **BUDGET)
     again = np.array(mi.render(edited, integrator=plugin, spp=4))
-    np.testing.assert_array_equal(again, before)
+    np.testing.assert_allclose(again, before, rtol=1e-5, atol=1e-7)
     change(mi.traverse(edited), *EDITS[edit])
     after = np.array(mi.render(edited, integrator=plugin, spp=4))
     fresh = np.array(mi.render(edited, integrator=mi.load_dict({"type": "radiosity", **BUDGET}), spp=4))

@@ -50,9 +50,11 @@ class Light:
 
     def fingerprint(self) -> bytes:
         """What tells it from other lamps: all parameters of the emitter."""
-        values = {name: getattr(value, "matrix", value) for name, value in mi.traverse(self.emitter)}
-        parts = [name.encode() + np.array(value, dtype=np.float32).tobytes() for name, value in sorted(values.items())]
-        return b"".join([self.emitter.class_name().encode(), *parts])
+        parts = [self.emitter.class_name().encode()]
+        for name, value in sorted(mi.traverse(self.emitter)):
+            number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
+            parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
+        return b"".join(parts)
 
 
 class Area(Light):
