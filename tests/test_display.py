@@ -160,7 +160,10 @@ def test_legs_that_end_in_solids_are_lit(elements):
                 T().translate([1, 1, 3.9]).rotate([1, 0, 0], 180).scale(0.4), bsdf=diffuse(), emitter=lamp(15)
             ),
         }
-        | {f"leg {k}": box([x - 0.03, y - 0.03, -0.05], [x + 0.03, y + 0.03, 1.05], 0.6) for k, (x, y) in enumerate(feet)}
+        | {
+            f"leg {k}": box([x - 0.03, y - 0.03, -0.05], [x + 0.03, y + 0.03, 1.05], 0.6)
+            for k, (x, y) in enumerate(feet)
+        }
     )
     solution = mr.solve(room, elements=elements, rays=300 * elements)
     gouraud, flat = (np.mean(solution.render(spp=64, shading=shading)) for shading in ("gouraud", "flat"))

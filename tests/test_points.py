@@ -299,7 +299,9 @@ def test_neighbouring_streams_share_no_bits(what):
     if what == "stream":
         pairs = [(stream_seed(k, a), stream_seed(k, b)) for k in cases for a, b in zip(Stream, list(Stream)[1:])]
     else:
-        step = {"seed": lambda k: stream_seed(k, Stream.POWER), "number": lambda k: stream_seed(1, Stream.PILOT, k)}[what]
+        step = {"seed": lambda k: stream_seed(k, Stream.POWER), "number": lambda k: stream_seed(1, Stream.PILOT, k)}[
+            what
+        ]
         pairs = [(step(k), step(k + 1)) for k in cases]
     flips = np.array([[(a ^ b) >> bit & 1 for bit in range(32)] for a, b in pairs]).mean(axis=0)
     assert np.abs(flips - 0.5).max() < sigmas(32) * 0.5 / len(pairs) ** 0.5

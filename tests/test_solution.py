@@ -178,7 +178,9 @@ def test_lux(under_a_lamp):
 def test_lux_by_channel():
     """Rec. 709: a lamp of one colour has its luminance weight."""
     parts = {"type": "area", "radiance": {"type": "rgb", "value": [0, 1 / np.pi, 0]}}
-    green = mr.solve(scene(box={"type": "cube", "flip_normals": True, "bsdf": diffuse(0.0), "emitter": parts}), **ANY_LIGHT)
+    green = mr.solve(
+        scene(box={"type": "cube", "flip_normals": True, "bsdf": diffuse(0.0), "emitter": parts}), **ANY_LIGHT
+    )
     assert green.irradiance([0, 0, 0], [1, 2, 3], lux=True) == pytest.approx([179 * 0.7152], rel=0.01)
 
 
