@@ -3,13 +3,13 @@
 import json
 from types import SimpleNamespace
 
-import mitsuba as mi
-import numpy as np
-import pytest
-
 from mi_radiosity.cli import main
 from mi_radiosity.evaluation import scenes
 from mi_radiosity.oracles import ORACLES
+
+import mitsuba as mi
+import numpy as np
+import pytest
 
 pytestmark = pytest.mark.fast
 

@@ -5,10 +5,6 @@ import os
 import sys
 from pathlib import Path
 
-import mitsuba as mi
-import numpy as np
-import pytest
-
 import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.evaluation import metrics, plots, reference, speed, tables
@@ -20,6 +16,10 @@ from mi_radiosity.evaluation.records import MORE_RAYS, interval
 from mi_radiosity.evaluation.reference import Reference, path_image, render_reference
 from mi_radiosity.evaluation.scenes import scene_file
 from mi_radiosity.oracles import ORACLES
+
+import mitsuba as mi
+import numpy as np
+import pytest
 
 BOX = "scenes_xml/box_furnace.xml"
 

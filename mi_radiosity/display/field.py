@@ -85,6 +85,8 @@ class Field:
     def _without_nodes(self, leaf, x, total, active):
         """H at points x of walled leaves that see no node: the leaf's own if light came down in sight, nothing if it
         came down elsewhere, and ``total`` where that is not known (Color3f [n])."""
+        if self._solution.landings.slots == 0:
+            return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
         own = dr.gather(mi.Color3f, self.flat, leaf, active)
         landed = self._has_landings(slot, active)
@@ -93,7 +95,7 @@ class Field:
     def _has_landings(self, slot, active):
         """Did light come down on crossed leaves of these slots (Bool [n])?"""
         landings, asked = self._solution.landings, active & (slot != NONE)
-        return asked & ~dr.isnan(landings.points(slot, mi.UInt32(0), asked)[0]) if landings.slots else asked
+        return asked & ~dr.isnan(landings.points(slot, mi.UInt32(0), asked)[0])
 
     def _light_in_sight(self, leaf, slot, x, active):
         """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
@@ -116,6 +118,8 @@ class Field:
     def _nodes_away_from_light(self, leaves, lit):
         """Nodes of crossed leaves that no light came down in sight of, a bit for each (UInt32 [leaves])."""
         dark = dr.zeros(mi.UInt32, dr.width(leaves))
+        if self._solution.landings.slots == 0:
+            return dark
         chosen = dr.compress(self._has_landings(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
         if dr.width(chosen) == 0:
             return dark

@@ -13,7 +13,6 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from .. import __version__
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..scene import Model
@@ -212,4 +211,4 @@ def _path() -> Any:
 
 def versions() -> dict[str, str]:
     """What results were made with."""
-    return {"mi_radiosity": __version__} | {name: version(name) for name in ("mitsuba", "drjit", "numpy")}
+    return {name: version(name) for name in ("mi_radiosity", "mitsuba", "drjit", "numpy")}

@@ -136,7 +136,8 @@ class Solution:
             a, b, s, t = kronecker(line, key, stream)
             lot = (mi.Float(line) + uniform(key ^ 0xA511E9B3, stream)) / mi.Float(each)
             origin = x + patches.origin + normal * patches.lift
-            H = gatherer.direct(x, normal, lot, a, b) + gatherer.indirect(origin, cosine_direction(normal, s, t))
+            room = gatherer.indirect(origin, cosine_direction(normal, s, t), k + opaque_index(first * samples), stream)
+            H = gatherer.direct(x, normal, lot, a, b) + room
             total[part] = np.array([dr.block_sum(c, samples) for c in H]).T / samples
         return total
 

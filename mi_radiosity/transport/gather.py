@@ -47,9 +47,17 @@ class Gatherer:
         weight = F * dr.gather(mi.Float, patches.area, lamp) / mi.Float(self._choice.probability(number))
         return dr.gather(mi.Color3f, patches.emission, lamp) * weight
 
-    def indirect(self, origin, direction, active=True):
-        """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n])."""
-        hit = self._model.rays.trace(origin, direction, active)
+    def indirect(self, origin, direction, number, seed, active=True):
+        """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n]).
+
+        number: UInt32 [n], seed: UInt32, what rays draw lobes by; what they meet behind lobes shines by itself, too.
+        """
+        model, elements = self._model, self._elements
+        hit = model.rays.follow(origin, direction, number, seed, active=active)
         met = active & (hit.patch != NONE)
-        leaf = self._elements.leaf_at(hit.patch, hit.u, hit.v, met)
-        return dr.gather(mi.Color3f, self._reflected, leaf, met)
+        leaf = elements.leaf_at(hit.patch, hit.u, hit.v, met)
+        H = dr.gather(mi.Color3f, self._reflected, leaf, met)
+        if model.rays.lobes is None:
+            return H
+        seen = dr.gather(mi.Color3f, model.patches.emission, hit.patch, met & hit.bounced & ~hit.coated)
+        return dr.select(active, hit.glow + hit.weight * (H + seen), 0)
