@@ -27,6 +27,8 @@ class Stream(IntEnum):
     STARVED = 4  # lines and rays of leaves that gather
     REACH = 5  # rays that look for light while a scene is read
     MEASURE = 6  # irradiance at points of the user's
+    ALBEDO = 7  # directions that the albedo of a diffuse lobe is found with
+    LOBES = 8  # what lobes rays draw on their way
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

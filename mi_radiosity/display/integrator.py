@@ -54,6 +54,7 @@ def _integrator_class():
         def prepare(self, scene):
             """The solution of ``scene``, solved now if there is none, or if the scene has been edited since."""
             require_variant()
+            refuse_gradients(scene)
             if self.solution is not None and self.solution.model.state.same_as(scene):
                 return self.solution
             if self._given:
@@ -73,7 +74,6 @@ def _integrator_class():
             return self.render(scene, sensor, seed=seed, spp=spp)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            refuse_gradients(scene)
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             # Mitsuba shrinks ray differentials to the spacing of samples.
@@ -88,15 +88,25 @@ def _integrator_class():
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             solution = self.prepare(scene)
-            rays = solution.model.rays
-            prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            hit = rays.locate(prelim, ray.d)
+            model, rays = solution.model, solution.model.rays
+            if rays.lobes is None:
+                prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+                hit = rays.locate(prelim, ray.d)
+            else:
+                number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
+                prelim, hit = None, rays.follow(ray.o, ray.d, number, seed, camera=True, active=active)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
-            reflectance = _reflectance(solution.model, prelim, ray, hit, lit)
-            look = Look(ray, hit, leaf, reflectance, lit, sampler, dr.opaque(mi.Float, self._pixel))
-            return dr.select(lit, self._shader.radiance(look), 0), valid, []
+            reflectance = _reflectance(model, prelim, ray, hit, lit)
+            emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
+            emission = dr.gather(mi.Color3f, model.patches.emission, hit.patch, emits)
+            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler, dr.opaque(mi.Float, self._pixel))
+            radiance = dr.select(lit, self._shader.radiance(look), 0)
+            if rays.lobes is not None:
+                radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
+                valid |= active & hit.bounced
+            return radiance, valid, []
 
         def traverse(self, callback):
             pass
@@ -113,15 +123,19 @@ def _integrator_class():
 
 def _reflectance(model, prelim, ray, hit, lit):
     """ρ where camera rays meet patches (Color3f [rays])."""
+    traced = model.rays.lobes is not None
     if not model.materials.textured:
         return dr.gather(mi.Color3f, model.patches.reflectance, hit.patch, lit)
-    if not model.rays.overlaps:
+    if not model.rays.overlaps and not traced:
         si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, lit)
         return si.bsdf().eval_diffuse_reflectance(si, lit)
     # The face shown need not be the one the ray met.
     patch = dr.select(lit, hit.patch, 0)
     face, back = dr.gather(mi.UInt32, model.patches.face, patch), dr.gather(mi.Bool, model.patches.back, patch)
-    return model.materials.reflectance_at(face, hit.u, hit.v, back)
+    value = model.materials.reflectance_at(face, hit.u, hit.v, back)
+    if not traced:
+        return value
+    return dr.select(model.materials.is_traced(face), dr.gather(mi.Color3f, model.patches.reflectance, patch), value)
 
 
 def register(*_) -> None:

@@ -21,6 +21,7 @@ class Look:
     ray: "mi.RayDifferential3f"
     hit: Hit
     leaf: "mi.UInt32"  # the element at the hit
+    emission: "mi.Color3f"  # E at the hit, W/m²
     reflectance: "mi.Color3f"  # ρ at the hit, textures and all
     lit: "mi.Bool"  # the ray meets a patch; the others are black
     sampler: "mi.Sampler"
@@ -52,8 +53,7 @@ class Shader:
 
     def radiance(self, look: Look) -> "mi.Color3f":
         """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays])."""
-        emission = dr.gather(mi.Color3f, self.solution.model.patches.emission, look.hit.patch, look.lit)
-        return (emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
+        return (look.emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
 
 
 class Gouraud(Shader):

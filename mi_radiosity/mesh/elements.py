@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
@@ -25,18 +26,25 @@ class Elements:
     ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
     """
 
+    patches: Patches
+    patch: "mi.UInt32"
+    parent: "mi.UInt32"
+    child: "mi.UInt32"
+    place: "mi.UInt32"
+    u0: "mi.Float"
+    v0: "mi.Float"
+    scale: "mi.Float"
+    area: "mi.Float"
+    reflectance: "mi.Color3f"
+
     def __init__(self, patches, arrays):
-        self.patches = patches
-        for name in ARRAYS:
-            setattr(self, name, arrays[name])
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches)
 
     def __len__(self):
         return dr.width(self.patch)
 
     def __setattr__(self, name, value):
-        if "_frozen" in vars(self):
-            raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
-        super().__setattr__(name, value)
+        raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
 
     @cached_property
     def leaves(self):
@@ -86,6 +94,8 @@ class Elements:
 class Tree(Elements):
     """Elements that still split. ``leaf_count`` is the number of leaves."""
 
+    __setattr__ = object.__setattr__
+
     def __init__(self, patches, materials):
         n = patches.count
         every = dr.arange(mi.UInt32, n)
@@ -100,9 +110,7 @@ class Tree(Elements):
 
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
-        elements = Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
-        elements._frozen = True
-        return elements
+        return Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
@@ -146,4 +154,7 @@ class Tree(Elements):
         total = mi.Color3f(0)
         for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
             total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
-        return total / 4
+        # Where other lobes are traced, ρ is one number per patch.
+        return dr.select(
+            self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
+        )

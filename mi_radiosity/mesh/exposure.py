@@ -90,7 +90,7 @@ def is_covered(elements, rays, leaf, u, v, s=0.3, t=0.6):
 
     def inside(direction, active):
         hit = rays.trace(origin, direction, active)
-        return active & hit.valid & (hit.patch == NONE)
+        return active & hit.valid & (hit.patch == NONE) & ~hit.traced
 
     return inside(other, inside(aside, inside(normal, ~lamp))) | ~rays.on_top(patch, u, v)
 

@@ -99,8 +99,12 @@ def _tracing_scene(scene):
     shapes = scene.shapes()
     if all(isinstance(shape, mi.Mesh) for shape in shapes):
         return scene
+    names = [shape.id() for shape in shapes]
     meshes = {f"shape_{i}": as_mesh(shape) for i, shape in enumerate(shapes)}
-    return mi.load_dict({"type": "scene"} | meshes, optimize=False)
+    tracing = mi.load_dict({"type": "scene"} | meshes, optimize=False)
+    for shape, name in zip(shapes, names):
+        shape.set_id(name)  # load_dict has given those that are in both scenes another
+    return tracing
 
 
 def _corners(scene):

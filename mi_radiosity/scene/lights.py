@@ -48,6 +48,14 @@ class Light:
         of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
 
+    def fingerprint(self) -> bytes:
+        """What tells it from other lamps: all parameters of the emitter."""
+        parts = [self.emitter.class_name().encode()]
+        for name, value in sorted(mi.traverse(self.emitter)):
+            number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
+            parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
+        return b"".join(parts)
+
 
 class Area(Light):
     """Mitsuba's `area` with a constant radiance L_e."""

@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.errors import RadiosityError
-from ..core.points import triangle
+from ..core.arrays import opaque_index, owned
+from ..core.points import Stream, kronecker, stream_seed, triangle
 from .lights import LIGHTS
 from .tessellate import can_mesh, label
 
@@ -15,10 +16,13 @@ DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
 POINTS = 16  # of a textured face, that its mean is taken over
+SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
+AT_ONCE = 1 << 22  # samples in one launch
 
 
 class Materials:
-    """What the faces are made of: ``rho`` [2 sides, faces, 3], ``two_sided`` [faces], ``textured`` (is any of them?).
+    """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
+    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes].
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -28,8 +32,15 @@ class Materials:
         shapes = faces.scene.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
         self.two_sided = two_sided[faces.shape]
-        self.textured = any(is_textured(s.bsdf()) for s in shapes)
-        self.rho = self._mean(POINTS if self.textured else 1)
+        textured = np.array([is_textured(s.bsdf()) for s in shapes])
+        self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
+        self._traced_faces = owned(mi.UInt32, self.traced[faces.shape])
+        self.textured = bool((textured & ~self.traced).any())
+        self.rho = np.zeros((2, len(faces), 3))
+        plain = ~self.traced[faces.shape]
+        if plain.any():
+            self.rho[:, plain] = self._mean(np.flatnonzero(plain), POINTS if self.textured else 1)
+        self._find_albedos(textured)
         faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
             (self.rho >= 1).any(axis=(0, 2)),
@@ -37,10 +48,10 @@ class Materials:
         )
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
-    def _mean(self, points):
-        """ρ averaged over points of every face [2 sides, faces, 3]."""
-        n = len(self._faces)
-        face, third, rho = dr.arange(mi.UInt32, n), mi.Float(1 / 3), np.zeros((2, n, 3))
+    def _mean(self, faces, points):
+        """ρ averaged over points of diffuse faces [2 sides, faces, 3]."""
+        n, third = len(faces), mi.Float(1 / 3)
+        face, rho = owned(mi.UInt32, faces), np.zeros((2, n, 3))
         for k in range(points):
             spread = triangle(*(mi.Float(x) for x in ((k + 0.5) / points, (k * 7 % points + 0.5) / points)))
             u, v = (x + dr.zeros(mi.Float, n) for x in ((third, third) if points == 1 else spread))
@@ -48,6 +59,45 @@ class Materials:
                 value = self.reflectance_at(face, u, v, dr.full(mi.Bool, side == 1, n))
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
+
+    def is_traced(self, face):
+        """Do faces have lobes that are traced (Bool [n])?"""
+        if not self.traced.any():
+            return mi.Bool(False)
+        return dr.gather(mi.UInt32, self._traced_faces, face) != 0
+
+    def _find_albedos(self, textured):
+        """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""
+        shape = self._faces.shape
+        first = np.searchsorted(shape, np.arange(len(self.traced)))
+        solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
+        various = np.flatnonzero((self.traced & textured)[shape])
+        for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, FACE_SAMPLES, False)):
+            for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
+                albedo = self._albedo(part, samples) if len(part) else np.zeros((2, 0, 3))
+                for rho, side in zip(albedo, self.rho):
+                    if spread:
+                        for face, value in zip(part, rho):
+                            side[shape == shape[face]] = value
+                    else:
+                        side[part] = rho
+
+    def _albedo(self, faces, samples):
+        """E[w; diffuse] of the BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+        each = opaque_index(samples)
+        k = dr.arange(mi.UInt32, len(faces) * samples)
+        face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
+        x, y, s, t = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO)))
+        a, b, c, _ = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO, 1)))
+        si, rho = self._faces.surface(face, *triangle(x, y)), []
+        wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
+        for side in (1, -1):
+            si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
+            sample, value = si.bsdf().sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
+            drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+            value = dr.select(drawn & dr.isfinite(value), value, 0)
+            rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
+        return np.array(rho)
 
     def reflectance_at(self, face, u, v, back):
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
@@ -73,7 +123,7 @@ def _nested(obj):
     class Collect(mi.TraversalCallback):
         found = ()
 
-        def put(self, name, value, flags):
+        def put(self, name, value, *_):
             if hasattr(value, "class_name"):
                 self.found += (value,)
 
@@ -82,15 +132,12 @@ def _nested(obj):
     return callback.found
 
 
-def _unsupported_bsdf(bsdf):
-    """Class name of the first part of ``bsdf`` that is not diffuse, or None."""
+def is_diffuse(bsdf) -> bool:
+    """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
-    if kind in DIFFUSE:
-        return None
-    if kind not in NESTING:
-        return kind
-    parts = (part for part in _nested(bsdf) if isinstance(part, mi.BSDF))
-    return next((bad for part in parts if (bad := _unsupported_bsdf(part))), None)
+    if kind in NESTING:
+        return all(is_diffuse(part) for part in _nested(bsdf) if isinstance(part, mi.BSDF))
+    return kind in DIFFUSE
 
 
 def is_textured(bsdf) -> bool:
@@ -106,8 +153,6 @@ def _inspect_shape(shape, name):
         return
     if shape.interior_medium() is not None or shape.exterior_medium() is not None:
         yield Finding(name, "participating media are not modelled: remove the medium")
-    if bad := _unsupported_bsdf(shape.bsdf()):
-        yield Finding(name, f"its BSDF {bad} is not diffuse: use 'diffuse', 'twosided' or a 'blendbsdf' of those")
     if shape.is_emitter() and mi.has_flag(shape.emitter().flags(), mi.EmitterFlags.SpatiallyVarying):
         yield Finding(name, "its radiance is textured: use a constant radiance")
 

@@ -20,7 +20,7 @@ class Model:
 
     sides: patches to make (see `Patches`); by default those that light can reach. ``warnings``: what a user should
     know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
-    orientation, reflectance and emission. ``state``: what the scene was like when it was read.
+    orientation, reflectance, emission and lamps. ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
@@ -51,7 +51,11 @@ class Model:
     def _find_overlaps(self):
         """Faces in one another: one of them is lit and shown wherever several are."""
         f, sound = self.faces, ~self.faces.degenerate
-        self._candidate = np.column_stack([sound, sound & self.materials.two_sided])  # [faces, front and back]
+        there = np.column_stack([sound, sound & self.materials.two_sided])  # [faces, front and back]
+        emits = self.lights.exitance.any(axis=1)[:, None] & [True, False]
+        # A side without a diffuse lobe receives nothing: what meets it goes on.
+        lobe = ~self.materials.traced[f.shape][:, None] | self.materials.rho.any(axis=2).T | emits
+        self._candidate = there & lobe
         exitance = self.lights.exitance.sum(axis=1)
         return find_overlaps(
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, lift_of(f)
@@ -59,7 +63,7 @@ class Model:
 
     def _rays(self, sides, overlaps):
         patches = make_patches(self.faces, self.materials, self.lights, sides)
-        return Rays(self.faces, patches, overlaps.lookup(self.faces.centre))
+        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
 
     def _sides(self, which):
         """Sides chosen by a mask [faces, 2], in the order of the faces' ranks."""
@@ -83,4 +87,6 @@ class Model:
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
+        for light in sorted(light.fingerprint() for light in self.lights.free):
+            digest.update(light)
         return digest.hexdigest()

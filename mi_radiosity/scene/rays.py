@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE, owned_vectors
+from ..core.arrays import NONE, owned, owned_vectors
 from ..core.points import cosine_direction
+from .lobes import Lobes
 from .patches import patch_table
 
 
@@ -19,13 +20,16 @@ class Hit:
     u: "mi.Float"  # [rays] barycentric coordinates on the face
     v: "mi.Float"
     back: "mi.Bool"  # [rays] the side they meet is the back of its face
+    traced: "mi.Bool"  # [rays] the surface has lobes that are not diffuse
 
 
 class Rays:
     """Visibility in a scene, in the words of its patches."""
 
-    def __init__(self, faces, patches, overlaps=None):
+    def __init__(self, faces, patches, materials, overlaps=None):
         self.scene, self.patches = faces.tracing, patches
+        self._traced = owned(mi.UInt32, materials.traced) if materials.traced.any() else None
+        self.lobes = Lobes(materials.traced) if materials.traced.any() else None
         self._first_face = faces.first_face
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
@@ -46,14 +50,28 @@ class Rays:
         valid = prelim.is_valid()
         face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
         back = dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
-        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid)
+        traced = mi.Bool(False)
+        if self._traced is not None:
+            traced = dr.gather(mi.UInt32, self._traced, prelim.shape_index, valid) != 0
+        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid, traced)
 
-    def side(self, face, back, u, v, valid) -> Hit:
+    def side(self, face, back, u, v, valid, traced=False) -> Hit:
         """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
         patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        return Hit(valid, dr.select(valid, patch, NONE), u, v, back)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v, back, mi.Bool(traced))
+
+    def follow(self, origin, direction, number, seed, power=False, camera=False, active=True):
+        """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
+
+        number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
+        camera: they look for light, and the first surface's own counts.
+        """
+        if self.lobes is None:
+            return self.trace(origin, direction, active)
+        mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
+        return self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, active)
 
     def on_top(self, patch, u, v):
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""

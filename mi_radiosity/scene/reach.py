@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NONE, components, owned
-from ..core.points import ROUNDS, Stream, kronecker, stream_seed, triangle
+from ..core.points import ROUNDS, Stream, hash_pair, kronecker, stream_seed, triangle
 
 PROBES = 32  # rays per side that look for light
 LAMP_PROBES = 1 << 16  # rays from all lamps together
@@ -34,9 +34,10 @@ def reached(rays, lights):
 
 def _cast(rays, patch, number):
     """Patches that cosine-distributed rays from patches meet, NONE for none (int [n])."""
+    seed = dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH))
     patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
-    u, v, s, t = kronecker(number, patch, dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH)))
-    return np.array(rays.trace(*rays.leave(patch, *triangle(u, v), s, t)).patch)
+    u, v, s, t = kronecker(number, patch, seed)
+    return np.array(rays.follow(*rays.leave(patch, *triangle(u, v), s, t), hash_pair(patch, number), seed).patch)
 
 
 def _from_lamps(rays, lamps):
@@ -68,5 +69,5 @@ def _from_free(rays, lights):
     for light in lights.free:
         n = dr.arange(mi.UInt32, LAMP_PROBES // len(lights.free))
         origin, direction, _ = light.shoot(*kronecker(n, dr.opaque(mi.UInt32, 0), dr.opaque(mi.UInt32, 0)))
-        met.append(np.array(rays.trace(origin, direction).patch))
+        met.append(np.array(rays.follow(origin, direction, n, dr.opaque(mi.UInt32, 0)).patch))
     return np.concatenate(met)

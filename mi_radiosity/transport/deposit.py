@@ -4,13 +4,24 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE
+from ..scene.lobes import Trail
 
 
 def pair_of(problem, batch, hit):
-    """The pair without children that each ray belongs to, NONE before its root exists (UInt32 [rays])."""
-    on_patch = (hit.patch != NONE) & (batch.patch != NONE)
+    """The pair without children that each ray belongs to (UInt32 [rays]).
+
+    NONE before its root exists, and for rays that belong to no pair: those of lamps that are no surface, and those
+    that went on through a lobe.
+    """
+    on_patch = straight(batch, hit)
     pair = problem.pairs.find_roots(hit.patch, batch.patch, on_patch)
     return problem.pairs.descend(pair, hit.u, hit.v, batch.u, batch.v, pair != NONE)
+
+
+def straight(batch, hit):
+    """Did rays go straight from a patch to a patch (Bool [rays])?"""
+    on_patch = (hit.patch != NONE) & (batch.patch != NONE)
+    return on_patch & ~hit.bounced if isinstance(hit, Trail) else on_patch
 
 
 def spread(problem, hit, pair):

@@ -29,16 +29,18 @@ class Gatherer:
         dr.scatter(self._density, mi.Float(probability / dr.gather(mi.Float, patches.area, self._lamps)), self._lamps)
         dr.eval(self._density)
 
-    def irradiance(self, x, normal, a, b, s, t, lot):
+    def irradiance(self, x, normal, a, b, s, t, lot, number, seed):
         """H from one line to the lamps (numbers ``a``, ``b``, ``lot`` in [0, 1)) and one cosine-distributed ray
-        (``s``, ``t``) (Color3f [n]).
+        (``s``, ``t``) (Color3f [n]). number, seed: as in `indirect`.
 
         Lamps are found by both; the balance heuristic (Veach 1997) weighs them, so that no estimate exceeds their
         exitance however near they are.
         """
-        patches = self._model.patches
-        hit = self._model.rays.trace(x + patches.origin + normal * patches.lift, cosine_direction(normal, s, t))
-        return self.direct(x, normal, lot, a, b, met=hit) + self.reflected(hit)
+        rays, patches = self._model.rays, self._model.patches
+        ray = x + patches.origin + normal * patches.lift, cosine_direction(normal, s, t)
+        met = rays.trace(*ray)
+        end = met if rays.lobes is None else rays.follow(*ray, number, seed)
+        return self.direct(x, normal, lot, a, b, met=met) + self._reflected_at(end)
 
     def direct(self, x, normal, lot, s, t, active=True, met=None):
         """H from the lamps: E F / p along a line to a point of a lamp that ``lot`` draws by power (Color3f [n]).
@@ -79,12 +81,19 @@ class Gatherer:
         weight = dr.select(met & (density > 0), cosines / (density * (dr.pi * r2 * r2) + cosines), 0)
         return dr.gather(mi.Color3f, patches.emission, hit.patch, met) * weight
 
-    def indirect(self, origin, direction, active=True):
-        """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n])."""
-        return self.reflected(self._model.rays.trace(origin, direction, active), active)
+    def indirect(self, origin, direction, number, seed, active=True):
+        """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n]).
 
-    def reflected(self, hit, active=True):
-        """The reflected radiosity where rays end (Color3f [n])."""
+        number: UInt32 [n], seed: UInt32, what rays draw lobes by; what they meet behind lobes shines by itself, too.
+        """
+        return self._reflected_at(self._model.rays.follow(origin, direction, number, seed, active=active), active)
+
+    def _reflected_at(self, hit, active=True):
+        model, elements = self._model, self._elements
         met = active & (hit.patch != NONE)
-        leaf = self._elements.leaf_at(hit.patch, hit.u, hit.v, met)
-        return dr.gather(mi.Color3f, self._reflected, leaf, met)
+        leaf = elements.leaf_at(hit.patch, hit.u, hit.v, met)
+        H = dr.gather(mi.Color3f, self._reflected, leaf, met)
+        if model.rays.lobes is None:
+            return H
+        seen = dr.gather(mi.Color3f, model.patches.emission, hit.patch, met & hit.bounced & ~hit.coated)
+        return dr.select(active, hit.glow + hit.weight * (H + seen), 0)

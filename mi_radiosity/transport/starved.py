@@ -79,5 +79,5 @@ class Starved:
         gatherer = Gatherer(model, e, e.reflectance * (flow.direct + flow.indirect))
         return {
             "direct": gatherer.direct(x, normal, lot, s, t, on_top),
-            "indirect": gatherer.indirect(*model.rays.leave(patch, u, v, s, t), on_top),
+            "indirect": gatherer.indirect(*model.rays.leave(patch, u, v, s, t), k, self._seed, on_top),
         }
