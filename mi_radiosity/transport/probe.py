@@ -34,9 +34,8 @@ def probe(gatherer: Gatherer, model, points, normals, samples, seed, progress=la
         dr.eval(scramble)
         # Any run of van der Corput's numbers is spread over the lamps.
         lot = mi.radical_inverse_2(line, dr.gather(mi.UInt32, scramble, of))
-        H = gatherer.irradiance(
-            x, normal, *kronecker(line, key, stream, of), lot, k + opaque_index(first * samples), stream
-        )
+        a, b, s, t = kronecker(line, key, stream, of)
+        H = gatherer.irradiance(x, normal, a, b, s, t, lot, k + opaque_index(first * samples), stream)
         runs = np.array([dr.block_sum(c, run) for c in H], dtype=np.float64).reshape(3, -1, RUNS) / run
         mean[part], error[part] = runs.mean(axis=2).T, runs.std(axis=2, ddof=1).T / RUNS**0.5
         progress(part.stop)
