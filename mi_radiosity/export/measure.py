@@ -13,7 +13,7 @@ from ..core.files import writing
 from ..solver import Solution
 from .grids import COLUMNS, Grid, inside_solids
 
-PANELS = 12  # surfaces that a picture shows, the largest
+PANELS, LEAST = 12, 0.05  # surfaces that a picture shows: the largest, and none below this part of the largest
 LEVELS = 9  # isolines, about
 
 
@@ -133,8 +133,9 @@ def _png(m, path):
     from matplotlib.ticker import MaxNLocator
 
     values = m.values if m.lux else m.values.mean(axis=1)
-    area = [np.linalg.norm(np.cross(s.u, s.v)) * s.rows * s.columns for s in m.grid.sheets]
-    shown = np.sort(np.argsort(area, kind="stable")[::-1][:PANELS])
+    area = np.array([np.linalg.norm(np.cross(s.u, s.v)) * s.rows * s.columns for s in m.grid.sheets])
+    largest = np.argsort(-area, kind="stable")[:PANELS]
+    shown = np.sort(largest[area[largest] >= LEAST * area.max()])
     high = np.nanmax(values, initial=0)
     levels = MaxNLocator(LEVELS).tick_values(0, high if high > 0 else 1)
     columns = int(np.ceil(len(shown) ** 0.5))

@@ -92,7 +92,7 @@ class Solution:
         points, normals = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-        gatherer = Gatherer(self.model, self.elements, self._reflected())
+        gatherer = Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
         report = partial(progress, "gather")
         found = probe(gatherer, self.model, points, normals, samples, seed, lambda done: report(done, len(points)))
         if lux:
