@@ -1,0 +1,192 @@
+"""Lightmaps: irradiance gathered at the points where texels of an atlas lie."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import NONE, owned, owned_vectors
+from ..core.errors import RadiosityError
+from ..core.extras import optional
+from ..scene import Model
+from ..solver import Solution
+from .atlas import SPOTS, Atlas, Spots, emission, on_surface, reflectance, spots, unwrap
+from .grids import inside_solids
+from .seams import level_seams
+from .walls_in_atlas import cut_at_walls
+
+SAMPLES = 256  # per texel
+LEAST, MOST = 16, 8192  # texels along a side
+RINGS = 2  # of texels around charts that are filled, for bilinear filtering and mipmaps
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Lightmap:
+    """Irradiance over an atlas; the first row of the pictures is at the top, as in glTF.
+
+    irradiance: H, W/m² [size, size, 3]. radiosity: B = E + ρ H, W/m² [size, size, 3]. reflectance: ρ [size, size, 3].
+    open: texels that light was gathered for [size, size]; the others are filled from their neighbours, or black.
+    area: what of the surface is open in each texel, m² [size, size]. error: standard error of H [size, size, 3].
+    """
+
+    atlas: Atlas
+    irradiance: np.ndarray
+    reflectance: np.ndarray
+    emission: np.ndarray
+    open: np.ndarray
+    area: np.ndarray
+    error: np.ndarray
+    rays: int
+
+    @property
+    def radiosity(self) -> np.ndarray:
+        return self.emission + self.reflectance * self.irradiance
+
+    def mean(self) -> np.ndarray:
+        """Mean irradiance of the open area, W/m² [3]."""
+        return (self.irradiance * self.area[..., None]).sum(axis=(0, 1)) / self.area.sum()
+
+
+def lightmap(
+    solution: Solution,
+    size: int,
+    samples: int = SAMPLES,
+    denoise: bool = False,
+    seed: int = 0,
+    progress: Progress = lambda stage, done, total: None,
+) -> Lightmap:
+    """Bake a lightmap of size × size texels.
+
+    samples: lines to the lamps, and as many rays into the room, per texel. denoise: by Open Image Denoise. progress is
+    called with ("unwrap" | "gather", done, total).
+    Raises RadiosityError for a size that is impossible or too small, and if a library is missing.
+    """
+    if not LEAST <= size <= MOST:
+        raise RadiosityError(f"a lightmap of {size} texels is impossible: choose {LEAST} to {MOST}")
+    if samples < 1:
+        raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+    denoiser: Any = optional("mitsuba_oidn", "--denoise", "denoise") if denoise else None
+    progress("unwrap", 0, 1)
+    atlas = unwrap(solution.model, cut_at_walls(solution, size), size)
+    progress("unwrap", 1, 1)
+    where = spots(atlas)
+    texels = _gather(solution, atlas, where, -(-samples // len(SPOTS)), seed, progress)
+    if denoiser is not None:
+        texels = _denoised(denoiser, texels)
+    return level_seams(solution.model, texels)
+
+
+def _gather(solution, atlas, where: Spots, samples, seed, progress):
+    """A Lightmap of what the spots of texels gather."""
+    model, n, k = solution.model, len(where.texel), len(SPOTS)
+    piece = np.repeat(where.piece, k)
+    points, normals, patch, uv = on_surface(model, atlas, piece, where.weight.reshape(-1, 3))
+    valid = _in_one_place(
+        model, points, normals, is_open(model, points, normals, patch, uv, 1 / atlas.per_metre)
+    ).ravel()
+    chosen = np.flatnonzero(valid)
+    found = solution.irradiance(
+        points[chosen], normals[chosen], samples=samples, seed=seed, return_error=True, progress=progress
+    )
+    H, error = (np.zeros((n * k, 3)) for _ in range(2))
+    H[chosen], error[chosen] = found
+    count = valid.reshape(n, k).sum(axis=1)[:, None]
+    mean = H.reshape(n, k, 3).sum(axis=1) / np.maximum(count, 1)
+    deviation = np.sqrt((error**2).reshape(n, k, 3).sum(axis=1)) / np.maximum(count, 1)
+    rho = reflectance(model, patch, uv).reshape(n, k, 3).mean(axis=1)
+    area = (valid.reshape(n, k) & where.inside).mean(axis=1) * atlas.texel_area(model)[where.piece]
+
+    def image(values, kind=np.float64):
+        out = np.zeros((atlas.size**2, *np.shape(values)[1:]), dtype=kind)
+        out[where.texel] = values
+        return out.reshape(atlas.size, atlas.size, *out.shape[1:])
+
+    chart = np.full(atlas.size**2, -1)
+    chart[where.texel] = atlas.chart[where.piece]
+    known = image(count[:, 0] > 0, bool)
+    fields = np.concatenate([image(mean), image(rho), image(emission(model, patch[::k]))], axis=2)
+    fields = fill(fields, known, chart.reshape(known.shape))
+    H, rho, E = np.split(fields, 3, axis=2)
+    rays = 2 * len(chosen) * -(-samples // 16) * 16
+    return Lightmap(atlas, H, rho, E, known, image(area), image(deviation), rays)
+
+
+def is_open(
+    model: Model, points: np.ndarray, normals: np.ndarray, patch: np.ndarray, uv: np.ndarray, gap: float
+) -> np.ndarray:
+    """Which points of patches does nothing cover (bool [n])? Sides that no light reaches do, up to ``gap`` m above."""
+    u, v = (owned(mi.Float, x) for x in uv.T)
+    on_top = model.rays.on_top(owned(mi.UInt32, patch), u, v)
+    x, normal = owned_vectors(mi.Point3f, points - model.faces.centre), owned_vectors(mi.Vector3f, normals)
+    x += normal * model.patches.lift
+    near = model.rays.blocked(x, x + normal * dr.opaque(mi.Float, gap), on_top)
+    hit = model.rays.trace(x + model.patches.origin, normal, near)
+    covered = ~on_top | (near & hit.valid & (hit.patch == NONE) & ~hit.traced)
+    return ~np.array(covered).astype(bool) & ~inside_solids(model, points, normals)
+
+
+def blocked(model: Model, a: np.ndarray, b: np.ndarray, lift_a: np.ndarray, lift_b: np.ndarray) -> np.ndarray:
+    """Does anything stand between points a and b [n, 3], lifted off their surfaces along normals (bool [n])?"""
+    ends = (
+        owned_vectors(mi.Point3f, x - model.faces.centre) + owned_vectors(mi.Vector3f, n) * model.patches.lift
+        for x, n in ((a, lift_a), (b, lift_b))
+    )
+    return np.array(model.rays.blocked(*ends)).astype(bool)
+
+
+def _in_one_place(model, points, normals, valid):
+    """The valid spots of every texel that its first valid one sees: no texel mixes two sides of a wall [texels, spots]."""
+    k = len(SPOTS)
+    valid = valid.reshape(-1, k)
+    first = np.arange(len(valid)) * k + valid.argmax(axis=1)
+    for spot in range(1, k):
+        chosen = np.flatnonzero(valid[:, spot] & (valid.argmax(axis=1) < spot))
+        if len(chosen):
+            a, b = first[chosen], chosen * k + spot
+            valid[chosen, spot] = ~blocked(model, points[a], points[b], normals[a], normals[b])
+    return valid
+
+
+def fill(values: np.ndarray, known: np.ndarray, chart: np.ndarray) -> np.ndarray:
+    """Fill texels that nothing is known of from their neighbours: all of a chart from the chart, and RINGS around it."""
+    values, known, chart = values.copy(), known.copy(), chart.copy()
+    rings = 0
+    while rings < RINGS:
+        total, count, label = np.zeros_like(values), np.zeros(known.shape), np.full(chart.shape, -1)
+        for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+            there, here = _shifted(dy, dx)
+            label[here] = np.where((label[here] < 0) & known[there], chart[there], label[here])
+            same = known[there] & np.where(chart[here] >= 0, chart[here] == chart[there], label[here] == chart[there])
+            total[here] += np.where(same[..., None], values[there], 0)
+            count[here] += same
+        inner = ~known & (chart >= 0) & (count > 0)
+        new = inner if inner.any() else ~known & (chart < 0) & (count > 0)
+        rings += not inner.any()
+        values[new] = total[new] / count[new][:, None]
+        chart[new & (chart < 0)] = label[new & (chart < 0)]
+        known |= new
+    return values
+
+
+def _shifted(dy, dx):
+    """Slices of an image: texels, and the neighbours of these."""
+
+    def along(d):
+        return slice(max(d, 0), d if d < 0 else None), slice(max(-d, 0), -d if d > 0 else None)
+
+    (ty, hy), (tx, hx) = along(dy), along(dx)
+    return (ty, tx), (hy, hx)
+
+
+def _denoised(denoiser, texels):
+    """Irradiance without noise; what is black stays black."""
+    from dataclasses import replace
+
+    H = np.ascontiguousarray(texels.irradiance, dtype=np.float32)
+    smooth = np.array(denoiser.denoise(H, hdr=True), dtype=np.float64)
+    return replace(texels, irradiance=np.where(H > 0, np.maximum(smooth, 0), 0))

@@ -1,0 +1,5 @@
+from .atlas import whole
+
+
+def cut_at_walls(solution, size):
+    return whole(solution.model)
