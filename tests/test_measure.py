@@ -6,7 +6,7 @@ import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.display import lux_scale
 from mi_radiosity.display.lux import VIRIDIS
-from mi_radiosity.export.grids import file_grid, inside_solids, plane_grid, shape_grid
+from mi_radiosity.export.grids import file_grid, plane_grid, shape_grid
 from mi_radiosity.export.measure import measure
 
 import drjit as dr
@@ -161,12 +161,12 @@ def test_grid_over_a_shape():
         block={"type": "cube", "to_world": T().rotate([0, 0, 1], 30).scale([1, 0.5, 0.25]), "bsdf": diffuse(0.5)},
         light=rectangle(T().translate([0, 0, 3]).rotate([1, 0, 0], 180), bsdf=diffuse(0), emitter=lamp()),
     )
-    model = mr.solve(parts, mr.Uniform(), elements=60, rays=2000).model
+    solution = mr.solve(parts, mr.Uniform(), elements=60, rays=2000)
+    model = solution.model
     grid = shape_grid(model, "block", 0.125)
     assert len(grid.sheets) == 6 and len(grid.points) == 2 * (16 * 8 + 16 * 4 + 8 * 4)
-    outside = grid.points + 1e-3 * grid.normals
-    assert not inside_solids(model, outside, grid.normals).any()
-    assert inside_solids(model, grid.points - 1e-3 * grid.normals, -grid.normals).all()
+    inside = replace(grid, points=grid.points - 1e-3 * grid.normals, normals=-grid.normals)
+    assert measure(solution, inside, samples=16).solid.all() and not measure(solution, grid, samples=16).solid.any()
     assert len(shape_grid(model, "block", 10).points) == 6
     with pytest.raises(mr.RadiosityError, match="no shape 'table': choose one of .*block"):
         shape_grid(model, "table")

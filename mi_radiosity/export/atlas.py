@@ -17,7 +17,7 @@ TRIES = 12  # at fitting charts into the texture
 SHRINK = 0.97  # at least, from one try to the next
 CHUNK = 1 << 20  # texels looked at in one go
 SPOTS = np.array([[-0.125, -0.375], [0.375, -0.125], [-0.375, 0.125], [0.125, 0.375]])  # of a texel that are sampled
-TUCK = 2.0**-12  # of a triangle, by which points stay off its sides: there a neighbour stands
+TUCK, MOST_TUCK = 0.1, 0.25  # of a texel, and of a triangle: points stay off its sides, where a neighbour stands
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,13 @@ class Atlas:
     chart: np.ndarray  # [pieces] number of the chart, −1 for none
     per_metre: float  # texels, about: charts are stretched to whole texels
 
+    def tuck(self) -> np.ndarray:
+        """How far points are drawn to the middle of their piece, of the way [pieces]."""
+        sides = self.place - np.roll(self.place, 1, axis=1)
+        around = np.linalg.norm(sides, axis=2).sum(axis=1)
+        radius = np.abs(_cross(sides[:, 1], sides[:, 2])) / np.maximum(around, 1e-30)  # of the circle within
+        return np.minimum(TUCK / np.maximum(radius, 1e-30), MOST_TUCK)
+
     def texel_area(self, model: Model) -> np.ndarray:
         """How much of a piece a texel shows, m² [pieces]."""
         points, place = self.pieces.points(model), self.place
@@ -64,7 +71,8 @@ class Spots:
     """Points that texels are sampled at, some for each texel that touches a piece."""
 
     texel: np.ndarray  # [texels] row · size + column
-    piece: np.ndarray  # [texels] the piece nearest to its centre
+    chart: np.ndarray  # [texels] the one nearest to its centre
+    piece: np.ndarray  # [texels, spots] of the chart, the piece nearest to the spot
     inside: np.ndarray  # [texels, spots] bool: the spot itself lies on the piece, not only the point nearest to it
     weight: np.ndarray  # [texels, spots, 3] barycentric coordinates on the piece
 
@@ -97,7 +105,8 @@ def unwrap(model: Model, pieces: Pieces, size: int) -> Atlas:
         atlas = _pack(points, pieces.group, scale)
         largest = max(atlas.width, atlas.height)
         if largest <= size and atlas.atlas_count == 1:
-            return Atlas(size, pieces, *_places(atlas, pieces.group), scale)
+            place, chart = _places(atlas, pieces.group)
+            return Atlas(size, pieces, place, chart, scale)
         scale *= min(size / largest, SHRINK)
     raise RadiosityError(
         f"{atlas.chart_count:,} charts do not fit into {size} × {size} texels: give --lightmap a larger size"
@@ -134,7 +143,29 @@ def _places(atlas, group):
 
 
 def spots(atlas: Atlas) -> Spots:
-    """Points to sample at, for every texel that touches a piece, on the piece nearest to its centre."""
+    """Points to sample at, for every texel that touches a piece."""
+    texel, piece, away = _touching(atlas)
+    order = np.lexsort((piece, away, texel))
+    texel, piece = texel[order], piece[order]
+    texels, first, row = np.unique(texel, return_index=True, return_inverse=True)
+    chart = atlas.chart[piece]
+    own = chart == chart[first][row]
+    row, piece = row[own], piece[own]
+    shape = (len(texels), len(SPOTS))
+    owner, inside, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool), np.zeros((*shape, 3))
+    centre = np.column_stack([texels % atlas.size, texels // atlas.size]) + 0.5
+    for k, spot in enumerate(SPOTS):
+        point, triangle = centre[row] + spot, atlas.place[piece]
+        w, within = nearest(triangle, point)
+        distance = np.linalg.norm(np.einsum("nk,nkc->nc", w, triangle) - point, axis=1)
+        best = np.lexsort((distance, row))
+        best = best[np.unique(row[best], return_index=True)[1]]
+        owner[:, k], inside[:, k], weight[:, k] = piece[best], within[best], w[best]
+    return Spots(texels, chart[first], owner, inside, weight)
+
+
+def _touching(atlas):
+    """Texels, the pieces that touch them, and how far these are from the texel's centre (three arrays [n])."""
     piece = np.flatnonzero(atlas.chart >= 0)
     low = np.floor(atlas.place[piece].min(axis=1) - 0.5).clip(0, atlas.size - 1).astype(np.int64)
     high = np.ceil(atlas.place[piece].max(axis=1) + 0.5).clip(1, atlas.size).astype(np.int64)
@@ -153,15 +184,7 @@ def spots(atlas: Atlas) -> Spots:
         touches = away.max(axis=1) <= 0.51  # sides that lie in the middle of texels touch them, or not, as a whole
         found.append((y * atlas.size + x, piece[which], away.max(axis=1), touches))
     texel, owner, away, touches = (np.concatenate(a) for a in zip(*found))
-    texel, owner, away = texel[touches], owner[touches], away[touches]
-    order = np.lexsort((owner, away, texel))
-    first = order[np.unique(texel[order], return_index=True)[1]]
-    texel, owner = texel[first], owner[first]
-    centre = np.column_stack([texel % atlas.size, texel // atlas.size]) + 0.5
-    at = (centre[:, None] + SPOTS).reshape(-1, 2)
-    weight, inside = nearest(np.repeat(atlas.place[owner], len(SPOTS), axis=0), at)
-    shape = (len(texel), len(SPOTS))
-    return Spots(texel, owner, inside.reshape(shape), weight.reshape(*shape, 3))
+    return texel[touches], owner[touches], away[touches]
 
 
 def nearest(triangles: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,8 +215,9 @@ def _cross(a, b):
 
 
 def on_surface(model: Model, atlas: Atlas, piece: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Points [n, 3] and unit shading normals [n, 3] of places on pieces, their patches [n], and where on these [n, 2]."""
-    pieces, weight = atlas.pieces, (1 - TUCK) * weight + TUCK / 3
+    """Points [n, 3] of places on pieces, unit shading normals [n, 3], patches [n], and coordinates on these [n, 2]."""
+    pieces, tuck = atlas.pieces, atlas.tuck()[piece, None]
+    weight = (1 - tuck) * weight + tuck / 3
     points = np.einsum("nk,nkc->nc", weight, pieces.points(model)[piece])
     normals = np.einsum("nk,nkc->nc", weight, pieces.normals(model)[piece])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -5,17 +5,12 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, opaque_index, owned_vectors
 from ..core.errors import RadiosityError
-from ..core.points import cosine_direction, kronecker
 from ..scene import Model
 from ..scene.overlap import EDGE, surfaces
 
-LOOKS = 8  # rays per point that look for the inside of a solid
 MOST = 4_000_000  # points of a grid
 CELLS = 20  # along the longest side of a grid, if no spacing is asked for
 COLUMNS = ("x", "y", "z", "nx", "ny", "nz")  # of a file of points
@@ -118,25 +113,6 @@ def file_grid(path: Path) -> Grid:
         raise RadiosityError(f"{path} holds no points")
     table = np.array(values)
     return Grid(table[:, :3], table[:, 3:])
-
-
-def inside_solids(model: Model, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Which points see nothing but backs that take no part in light transport: the inside of solids (bool [n])?
-
-    normals: of unit length; rays start off the points by the rounding of rays.
-    """
-    n = len(points)
-    if n == 0:
-        return np.zeros(0, dtype=bool)
-    patches, rays, every = model.patches, model.rays, dr.arange(mi.UInt32, n)
-    normal = owned_vectors(mi.Vector3f, normals)
-    x = owned_vectors(mi.Point3f, points - model.faces.centre) + patches.origin + normal * patches.lift
-    inside = dr.full(mi.Bool, True, n)
-    for look in range(LOOKS):
-        _, _, s, t = kronecker(opaque_index(look), every, opaque_index(0))
-        hit = rays.trace(x, cosine_direction(normal, s, t), inside)
-        inside &= hit.valid & hit.back & (hit.patch == NONE) & ~hit.traced
-    return np.array(inside).astype(bool)
 
 
 # ---- Sheets ----------------------------------------------------------------------------------------

@@ -4,19 +4,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, owned, owned_vectors
 from ..core.errors import RadiosityError
 from ..core.extras import optional
-from ..scene import Model
 from ..solver import Solution
-from .atlas import SPOTS, Atlas, Spots, emission, on_surface, reflectance, spots, unwrap
-from .grids import inside_solids
+from .atlas import SPOTS, Atlas, emission, on_surface, reflectance, spots, unwrap, whole
 from .seams import level_seams
-from .walls_in_atlas import cut_at_walls
+from .visible import blocked, hidden, on_top
+from .dividing import cut_at_walls
 
 SAMPLES = 256  # per texel
 LEAST, MOST = 16, 8192  # texels along a side
@@ -72,34 +68,38 @@ def lightmap(
         raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
     denoiser: Any = optional("mitsuba_oidn", "--denoise", "denoise") if denoise else None
     progress("unwrap", 0, 1)
-    atlas = unwrap(solution.model, cut_at_walls(solution, size), size)
-    progress("unwrap", 1, 1)
+    atlas = unwrap(solution.model, whole(solution.model), size)
     where = spots(atlas)
+    if pieces := cut_at_walls(solution, atlas, where):
+        atlas = unwrap(solution.model, pieces, size)
+        where = spots(atlas)
+    progress("unwrap", 1, 1)
     texels = _gather(solution, atlas, where, -(-samples // len(SPOTS)), seed, progress)
     if denoiser is not None:
         texels = _denoised(denoiser, texels)
     return level_seams(solution.model, texels)
 
 
-def _gather(solution, atlas, where: Spots, samples, seed, progress):
+def _gather(solution, atlas, where, samples, seed, progress):
     """A Lightmap of what the spots of texels gather."""
     model, n, k = solution.model, len(where.texel), len(SPOTS)
-    piece = np.repeat(where.piece, k)
-    points, normals, patch, uv = on_surface(model, atlas, piece, where.weight.reshape(-1, 3))
-    valid = _in_one_place(
-        model, points, normals, is_open(model, points, normals, patch, uv, 1 / atlas.per_metre)
-    ).ravel()
+    points, normals, patch, uv = on_surface(model, atlas, where.piece.ravel(), where.weight.reshape(-1, 3))
+    valid = on_top(model, patch, uv)
     chosen = np.flatnonzero(valid)
     found = solution.irradiance(
         points[chosen], normals[chosen], samples=samples, seed=seed, return_error=True, progress=progress
     )
     H, error = (np.zeros((n * k, 3)) for _ in range(2))
     H[chosen], error[chosen] = found
+    valid[hidden(model, points, normals, H, valid)] = False
+    valid = _in_one_place(model, points, normals, valid).ravel()
+    H[~valid] = error[~valid] = 0
     count = valid.reshape(n, k).sum(axis=1)[:, None]
     mean = H.reshape(n, k, 3).sum(axis=1) / np.maximum(count, 1)
     deviation = np.sqrt((error**2).reshape(n, k, 3).sum(axis=1)) / np.maximum(count, 1)
     rho = reflectance(model, patch, uv).reshape(n, k, 3).mean(axis=1)
-    area = (valid.reshape(n, k) & where.inside).mean(axis=1) * atlas.texel_area(model)[where.piece]
+    area = (atlas.texel_area(model)[where.piece] * (valid.reshape(n, k) & where.inside)).mean(axis=1)
+    E = emission(model, patch).reshape(n, k, 3).mean(axis=1)
 
     def image(values, kind=np.float64):
         out = np.zeros((atlas.size**2, *np.shape(values)[1:]), dtype=kind)
@@ -107,40 +107,18 @@ def _gather(solution, atlas, where: Spots, samples, seed, progress):
         return out.reshape(atlas.size, atlas.size, *out.shape[1:])
 
     chart = np.full(atlas.size**2, -1)
-    chart[where.texel] = atlas.chart[where.piece]
+    chart[where.texel] = where.chart
     known = image(count[:, 0] > 0, bool)
-    fields = np.concatenate([image(mean), image(rho), image(emission(model, patch[::k]))], axis=2)
+    fields = np.concatenate([image(mean), image(rho), image(E)], axis=2)
     fields = fill(fields, known, chart.reshape(known.shape))
     H, rho, E = np.split(fields, 3, axis=2)
     rays = 2 * len(chosen) * -(-samples // 16) * 16
     return Lightmap(atlas, H, rho, E, known, image(area), image(deviation), rays)
 
 
-def is_open(
-    model: Model, points: np.ndarray, normals: np.ndarray, patch: np.ndarray, uv: np.ndarray, gap: float
-) -> np.ndarray:
-    """Which points of patches does nothing cover (bool [n])? Sides that no light reaches do, up to ``gap`` m above."""
-    u, v = (owned(mi.Float, x) for x in uv.T)
-    on_top = model.rays.on_top(owned(mi.UInt32, patch), u, v)
-    x, normal = owned_vectors(mi.Point3f, points - model.faces.centre), owned_vectors(mi.Vector3f, normals)
-    x += normal * model.patches.lift
-    near = model.rays.blocked(x, x + normal * dr.opaque(mi.Float, gap), on_top)
-    hit = model.rays.trace(x + model.patches.origin, normal, near)
-    covered = ~on_top | (near & hit.valid & (hit.patch == NONE) & ~hit.traced)
-    return ~np.array(covered).astype(bool) & ~inside_solids(model, points, normals)
-
-
-def blocked(model: Model, a: np.ndarray, b: np.ndarray, lift_a: np.ndarray, lift_b: np.ndarray) -> np.ndarray:
-    """Does anything stand between points a and b [n, 3], lifted off their surfaces along normals (bool [n])?"""
-    ends = (
-        owned_vectors(mi.Point3f, x - model.faces.centre) + owned_vectors(mi.Vector3f, n) * model.patches.lift
-        for x, n in ((a, lift_a), (b, lift_b))
-    )
-    return np.array(model.rays.blocked(*ends)).astype(bool)
-
-
 def _in_one_place(model, points, normals, valid):
-    """The valid spots of every texel that its first valid one sees: no texel mixes two sides of a wall [texels, spots]."""
+    """Those of the valid spots that the first one of their texel sees, lest texels mix two sides of a wall
+    [texels, spots]."""
     k = len(SPOTS)
     valid = valid.reshape(-1, k)
     first = np.arange(len(valid)) * k + valid.argmax(axis=1)
@@ -153,7 +131,7 @@ def _in_one_place(model, points, normals, valid):
 
 
 def fill(values: np.ndarray, known: np.ndarray, chart: np.ndarray) -> np.ndarray:
-    """Fill texels that nothing is known of from their neighbours: all of a chart from the chart, and RINGS around it."""
+    """Fill texels that nothing is known of from their neighbours: those of charts, and RINGS around them."""
     values, known, chart = values.copy(), known.copy(), chart.copy()
     rings = 0
     while rings < RINGS:

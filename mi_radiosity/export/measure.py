@@ -11,7 +11,8 @@ from ..core.errors import RadiosityError
 from ..core.extras import optional
 from ..core.files import writing
 from ..solver import Solution
-from .grids import COLUMNS, Grid, inside_solids
+from .grids import COLUMNS, Grid
+from .visible import hidden
 
 PANELS, LEAST = 12, 0.05  # surfaces that a picture shows: the largest, and none below this part of the largest
 LEVELS = 9  # isolines, about
@@ -64,18 +65,12 @@ def measure(
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Measurement:
     """Irradiance, or illuminance with ``lux``, at the points of a grid: see `Solution.irradiance`."""
-    solid = inside_solids(solution.model, grid.points, grid.normals)
-    found = solution.irradiance(
-        grid.points[~solid],
-        grid.normals[~solid],
-        lux=lux,
-        samples=samples,
-        seed=seed,
-        return_error=True,
-        progress=progress,
+    values, errors = solution.irradiance(
+        grid.points, grid.normals, lux=lux, samples=samples, seed=seed, return_error=True, progress=progress
     )
-    values, errors = (np.full((len(solid), *f.shape[1:]), np.nan) for f in found)
-    values[~solid], errors[~solid] = found
+    normals = grid.normals / np.linalg.norm(grid.normals, axis=1, keepdims=True)
+    inside = hidden(solution.model, grid.points, normals, values)
+    values[inside] = errors[inside] = np.nan
     return Measurement(grid, values, errors, lux)
 
 

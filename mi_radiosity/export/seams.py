@@ -8,6 +8,7 @@ import numpy as np
 from ..core.extras import optional
 from ..scene import Model
 from .atlas import Atlas, on_surface
+from .visible import blocked
 
 if TYPE_CHECKING:
     from .lightmap import Lightmap
@@ -19,8 +20,10 @@ PER_TEXEL = 2  # places along a seam
 
 
 def level_seams(model: Model, texels: "Lightmap") -> "Lightmap":
-    """The lightmap that differs least from ``texels`` and is equal on both sides of seams, in the sense of least squares:
-    min Σ w (H − H₀)² + STIFF Σ (H_a − H_b)²."""
+    """The lightmap nearest to ``texels`` that is equal on both sides of seams.
+
+    min Σ w (H − H₀)² + STIFF Σ (H_a − H_b)², over all texels, and over places along the seams.
+    """
     a, b = seam_samples(model, texels.atlas)
     if not len(a[0]):
         return texels
@@ -45,8 +48,6 @@ def level_seams(model: Model, texels: "Lightmap") -> "Lightmap":
 
 def seam_samples(model: Model, atlas: Atlas) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Places along seams, on both sides: the four texels that are filtered there, and their weights ([n, 4] each)."""
-    from .lightmap import blocked
-
     first, second, flipped = _pairs(model, atlas)
     length = np.linalg.norm(_end(atlas, first, 1) - _end(atlas, first, 0), axis=1)
     each = np.ceil(PER_TEXEL * length).astype(int) + 1
@@ -54,9 +55,7 @@ def seam_samples(model: Model, atlas: Atlas) -> tuple[tuple[np.ndarray, np.ndarr
     t = (np.arange(len(which)) - np.repeat(np.cumsum(each) - each, each)) / np.maximum(each[which] - 1, 1)
     weights = [_along(side, which, s) for side, s in ((first, t), (second, np.where(flipped[which], 1 - t, t)))]
     ends = [on_surface(model, atlas, side[0][which], w)[:2] for side, w in zip((first, second), weights)]
-    apart = np.zeros(len(which), dtype=bool)
-    if len(which):
-        apart = blocked(model, ends[0][0], ends[1][0], ends[0][1], ends[1][1])
+    apart = blocked(model, ends[0][0], ends[1][0], ends[0][1], ends[1][1])
     places = [
         np.einsum("nk,nkc->nc", w, atlas.place[side[0][which]])[~apart] for side, w in zip((first, second), weights)
     ]
@@ -76,7 +75,7 @@ def bilinear(place: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pairs(model, atlas):
-    """Sides of pieces (piece, side) that are one in space and two in the texture, and whether they run opposite ways."""
+    """Sides of pieces (piece, side) that are one in space and two in the texture; do they run opposite ways?"""
     piece = np.repeat(np.flatnonzero(atlas.chart >= 0), 3)
     side = np.tile(np.arange(3), len(piece) // 3)
     points, normals = atlas.pieces.points(model), atlas.pieces.normals(model)

@@ -1,0 +1,69 @@
+"""What of a surface is hidden, and which of its points see each other."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import NONE, opaque_index, owned, owned_vectors
+from ..core.points import cosine_direction, kronecker
+from ..scene import Model
+
+LOOKS = 8  # rays per point that look for the inside of a solid
+POCKET = 0.05  # of the scene's diagonal: what is narrower all around a point is no room
+
+
+def hidden(
+    model: Model, points: np.ndarray, normals: np.ndarray, light: np.ndarray, asked: np.ndarray | None = None
+) -> np.ndarray:
+    """Numbers of the points that lie inside of solids, or in gaps under them, not just in the dark.
+
+    points, normals (unit): [n, 3]. light: what was found there [n, …]; only points that have none, and that are
+    ``asked`` for (bool [n]), are looked at: whether most of what they see are backs that take no part in light
+    transport, or whether all of it is near.
+    """
+    dark = light.reshape(len(points), -1).max(axis=1, initial=0) == 0
+    dark = np.flatnonzero(dark if asked is None else dark & asked)
+    if not len(dark):
+        return dark
+    x, normal = _above(model, points[dark], normals[dark])
+    size = np.linalg.norm(np.ptp(model.faces.corners.reshape(-1, 3), axis=0))
+    near, pocket = dr.opaque(mi.Float, POCKET * float(size)), dr.full(mi.Bool, True, len(dark))
+    every, backs = dr.arange(mi.UInt32, len(dark)), mi.UInt32(0)
+    for look in range(LOOKS):
+        _, _, s, t = kronecker(opaque_index(look), every, opaque_index(0))
+        direction = cosine_direction(normal, s, t)
+        hit = model.rays.trace(x + model.patches.origin, direction)
+        backs += dr.select(hit.valid & hit.back & (hit.patch == NONE) & ~hit.traced, mi.UInt32(1), 0)
+        pocket &= model.rays.blocked(x, x + direction * near, pocket)
+    return dark[np.array(pocket | (2 * backs > LOOKS)).astype(bool)]
+
+
+def on_top(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Which points of patches does nothing lie on in their plane (bool [n])?"""
+    u, v = (owned(mi.Float, x) for x in uv.T)
+    return np.array(model.rays.on_top(owned(mi.UInt32, patch), u, v)).astype(bool)
+
+
+def blocked(model: Model, a: np.ndarray, b: np.ndarray, normal_a: np.ndarray, normal_b: np.ndarray) -> np.ndarray:
+    """Does anything stand between points a and b of surfaces [n, 3] (bool [n])?"""
+    if not len(a):
+        return np.zeros(0, dtype=bool)
+    ends = (_above(model, points, normals)[0] for points, normals in ((a, normal_a), (b, normal_b)))
+    return np.array(model.rays.blocked(*ends)).astype(bool)
+
+
+def first_faces(model: Model, a: np.ndarray, b: np.ndarray, normal_a: np.ndarray, normal_b: np.ndarray) -> np.ndarray:
+    """The faces that rays from points a to b, which do not see each other, meet first (int [n])."""
+    if not len(a):
+        return np.zeros(0, dtype=np.int64)
+    start, end = (_above(model, points, normals)[0] for points, normals in ((a, normal_a), (b, normal_b)))
+    ray = mi.Ray3f(start + model.patches.origin, end - start)
+    prelim = model.rays.scene.ray_intersect_preliminary(ray)
+    face = dr.gather(mi.UInt32, model.faces.first_face, prelim.shape_index, prelim.is_valid()) + prelim.prim_index
+    return np.array(face, dtype=np.int64)
+
+
+def _above(model, points, normals):
+    """Points relative to the origin of the patches, off their surfaces by the rounding of rays, and normals."""
+    normal = owned_vectors(mi.Vector3f, normals)
+    return owned_vectors(mi.Point3f, points - model.faces.centre) + normal * model.patches.lift, normal
