@@ -92,7 +92,7 @@ class Solution:
         points, normals = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-        gatherer = Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+        gatherer = self.gatherer()
         report = partial(progress, "gather")
         found = probe(gatherer, self.model, points, normals, samples, seed, lambda done: report(done, len(points)))
         if lux:
@@ -137,6 +137,10 @@ class Solution:
     def field(self) -> Field:
         """H as a continuous field over the surfaces."""
         return Field(self)
+
+    def gatherer(self) -> Gatherer:
+        """What gathers irradiance at any places, by this solution's radiosity."""
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
 
     def _reflected(self):
         return self.elements.reflectance * self.irradiance()
