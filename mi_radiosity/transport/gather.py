@@ -31,21 +31,20 @@ class Gatherer:
         if dr.width(self._lamps):
             total += self._from_surfaces(x, normal, lot, s, t, active)
         for light in self._free:
-            direction, distance, irradiance = light.sample(x + self._model.patches.origin, s, t)
-            cosine = dr.dot(direction, normal)
-            lit = active & (cosine > 0)
-            start = x + normal * self._model.patches.lift
-            hidden = self._model.rays.blocked(start, start + direction * distance, lit)
-            total += dr.select(lit & ~hidden, irradiance * cosine, 0)
+            total += light.lights_up(self._model.rays, x, normal, s, t, active)
         return total
 
     def _from_surfaces(self, x, normal, lot, s, t, active):
         patches = self._model.patches
         number = self._choice.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._choice.whole))
         lamp = dr.gather(mi.UInt32, self._lamps, number)
-        F = self._model.rays.kernel_at(x, normal, lamp, *triangle(s, t), active)
+        u, v = triangle(s, t)
+        F = self._model.rays.kernel_at(x, normal, lamp, u, v, active)
         weight = F * dr.gather(mi.Float, patches.area, lamp) / mi.Float(self._choice.probability(number))
-        return dr.gather(mi.Color3f, patches.emission, lamp) * weight
+        emission = dr.gather(mi.Color3f, patches.emission, lamp)
+        if self._model.lights.textured:
+            emission = self._model.lights.exitance_at(dr.gather(mi.UInt32, patches.face, lamp), u, v, F > 0)
+        return emission * weight
 
     def indirect(self, origin, direction, number, seed, active=True):
         """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n]).
@@ -59,5 +58,6 @@ class Gatherer:
         H = dr.gather(mi.Color3f, self._reflected, leaf, met)
         if model.rays.lobes is None:
             return H
-        seen = dr.gather(mi.Color3f, model.patches.emission, hit.patch, met & hit.bounced & ~hit.coated)
-        return dr.select(active, hit.glow + hit.weight * (H + seen), 0)
+        seen = model.lights.seen(model.patches, hit, met & hit.bounced & ~hit.coated)
+        sky = model.lights.sky(hit.direction, active & hit.bounced & ~hit.valid)
+        return dr.select(active, hit.glow + hit.weight * (H + seen + sky), 0)
