@@ -129,7 +129,7 @@ def test_power_arrives_where_lines_to_the_lamp_say(name):
 
 
 def test_directionalarea_lights_what_is_straight_ahead():
-    """E falls on the floor below a lamp of exitance E, less what the block is in the way of; its shape reflects, too."""
+    """E falls on the floor below a lamp of exitance E, less what the block is in the way of; its shape reflects."""
     emitter = {"type": "directionalarea", "radiance": rgb(1, 2, 3)}
     truth = plate(lamp=rectangle(SHINING, bsdf=diffuse(0.3), emitter=emitter))
     solution = mr.solve(truth, elements=2000, rays=200_000)

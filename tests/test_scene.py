@@ -111,10 +111,9 @@ def test_fingerprint_ignores_the_order_of_shapes():
 @pytest.mark.parametrize(
     "shape, says",
     [
-        (rectangle(id="mirror", bsdf={"type": "conductor"}), "mirror.*SmoothConductor"),
         (rectangle(id="bright", bsdf=diffuse(1.0)), "bright.*less than 1"),
     ],
-    ids=["conductor", "white"],
+    ids=["white"],
 )
 def test_refused_by_name(shape, says):
     bad = over(shape)

@@ -54,6 +54,7 @@ def _integrator_class():
         def prepare(self, scene):
             """The solution of ``scene``, solved now if there is none, or if the scene has been edited since."""
             require_variant()
+            refuse_gradients(scene)
             if self.solution is not None and self.solution.model.state.same_as(scene):
                 return self.solution
             if self._given:
@@ -73,7 +74,6 @@ def _integrator_class():
             return self.render(scene, sensor, seed=seed, spp=spp)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            refuse_gradients(scene)
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             # Mitsuba shrinks ray differentials to the spacing of samples.

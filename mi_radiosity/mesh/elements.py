@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
@@ -26,18 +27,26 @@ class Elements:
     with textured lamps, None in others. `Tree` grows; what its `freeze` returns never changes.
     """
 
+    patches: Patches
+    patch: "mi.UInt32"
+    parent: "mi.UInt32"
+    child: "mi.UInt32"
+    place: "mi.UInt32"
+    u0: "mi.Float"
+    v0: "mi.Float"
+    scale: "mi.Float"
+    area: "mi.Float"
+    reflectance: "mi.Color3f"
+    exitance: "mi.Color3f | None"
+
     def __init__(self, patches, arrays, exitance=None):
-        self.patches, self.exitance = patches, exitance
-        for name in ARRAYS:
-            setattr(self, name, arrays[name])
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
 
     def __len__(self):
         return dr.width(self.patch)
 
     def __setattr__(self, name, value):
-        if "_frozen" in vars(self):
-            raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
-        super().__setattr__(name, value)
+        raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
 
     @cached_property
     def leaves(self):
@@ -89,6 +98,8 @@ class Elements:
 class Tree(Elements):
     """Elements that still split. ``leaf_count`` is the number of leaves."""
 
+    __setattr__ = object.__setattr__
+
     def __init__(self, patches, materials, lights):
         n = patches.count
         every = dr.arange(mi.UInt32, n)
@@ -106,10 +117,7 @@ class Tree(Elements):
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
         arrays = {name: type(value)(value) for name, value in self._arrays().items()}
-        exitance = None if self.exitance is None else mi.Color3f(self.exitance)
-        elements = Elements(self.patches, arrays, exitance)
-        elements._frozen = True
-        return elements
+        return Elements(self.patches, arrays, None if self.exitance is None else mi.Color3f(self.exitance))
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}

@@ -57,9 +57,13 @@ class Light:
         of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
 
-    def identity(self):
-        """Numbers that change with the lamp (NumPy)."""
-        return np.array(self.power(), dtype=np.float64)
+    def fingerprint(self) -> bytes:
+        """What tells it from other lamps: all parameters of the emitter."""
+        parts = [self.emitter.class_name().encode()]
+        for name, value in sorted(mi.traverse(self.emitter)):
+            number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
+            parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
+        return b"".join(parts)
 
     def lights_up(self, rays, x, normal, s, t, active=True):
         """H at points x, relative to the patches' origin, with their normals: one `sample` each (Color3f [n])."""
@@ -86,7 +90,7 @@ class Area(Light):
 class Free(Light):
     """Lamps at a point, by Mitsuba's own sampling: `point`, `spot` and `projector`, textured or not."""
 
-    emitters = ("PointLight", "SpotLight", "Projector")
+    emitters: tuple[str, ...] = ("PointLight", "SpotLight", "Projector")
 
     def __init__(self, emitter, scene, low, high):
         super().__init__(emitter, scene, low, high)
@@ -97,15 +101,15 @@ class Free(Light):
     def power(self):
         return self._power
 
-    def identity(self):
-        """Power, and a few rays, to three digits (NumPy)."""
+    def fingerprint(self):
+        """Power and a few rays, to three digits: not all parameters are shown to Python."""
         number = dr.arange(mi.UInt32, 16)
         origin, direction, weight = self.shoot(*kronecker(number, opaque_index(0), opaque_index(0)))
-        origin = (np.array(origin).reshape(3, -1).T - self.low) / max(np.max(self.high - self.low), 1e-30)
-        weight = np.array(weight).reshape(3, -1).T / max(*self._power, 1e-30)
+        rows = [np.array(x, dtype=np.float64).reshape(3, -1).T for x in (origin, direction, weight)]
+        rows[0] = (rows[0] - self.low) / max(np.max(self.high - self.low), 1e-30)
+        rows[2] = rows[2] / max(*self._power, 1e-30)
         power = [float(f"{p:.3g}") for p in self._power]
-        rays = np.column_stack([origin, np.array(direction).reshape(3, -1).T, weight])
-        return np.concatenate([power, np.round(rays.ravel(), 2)]) + 0.0
+        return (np.concatenate([power, np.round(np.column_stack(rows).ravel(), 2)]) + 0.0).tobytes()
 
     def shoot(self, x, y, s, t):
         ray, weight = self.emitter.sample_ray(0.0, 0.0, mi.Point2f(x, y), mi.Point2f(s, t))
@@ -202,7 +206,7 @@ class Lights:
         self.exitance = self._of_faces(np.flatnonzero(np.array(lamps)[faces.shape]))
         self.free = self._free()
         if not (self.exitance * faces.area[:, None]).any() and not any(any(light.power()) for light in self.free):
-            raise RadiosityError("the scene has no light: give at least one shape an 'area' emitter")
+            raise RadiosityError("the scene has no light: add a lamp, such as an 'area' emitter of a shape")
 
     def _of_faces(self, lamps):
         """E of all faces, those of ``lamps`` (int [n]) only being more than 0."""
@@ -223,7 +227,7 @@ class Lights:
         box = corners.min(axis=0), corners.max(axis=0)
         kinds = [(emitter, LIGHTS.find(emitter.class_name())) for emitter in scene.emitters()]
         lights = [kind(emitter, scene, *box) for emitter, kind in kinds if not kind.on_surface]
-        return sorted(lights, key=lambda light: light.identity().tolist())
+        return sorted(lights, key=lambda light: light.fingerprint())
 
     # ---- Light at points and in directions -----------------------------------------------------
 

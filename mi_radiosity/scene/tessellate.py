@@ -99,8 +99,10 @@ def tracing_scene(scene):
         return scene, found
     box = scene.bbox()
     size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    meshes = [as_mesh(part, size) for part in found]
+    meshes, names = [as_mesh(part, size) for part in found], [part.shape.id() for part in found]
     tracing = mi.load_dict({"type": "scene"} | {f"shape_{i}": mesh for i, mesh in enumerate(meshes)}, optimize=False)
+    for part, name in zip(found, names):
+        part.shape.set_id(name)  # load_dict has given those that are in both scenes another
     by_pointer = {mesh.ptr: part for mesh, part in zip(meshes, found)}
     return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()]
 
