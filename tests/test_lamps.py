@@ -67,7 +67,8 @@ def plate(**parts):
             "block": {"type": "cube", "bsdf": diffuse(0.7), "to_world": at().translate([-0.5, 0, 0.3]).scale(0.3)},
             "wall": rectangle(bsdf=diffuse(0.4, two_sided=True), to_world=wall),
             **parts,
-        }
+        },
+        optimize=False,
     )
 
 

@@ -10,7 +10,7 @@ from ..core.errors import RadiosityError
 from ..core.arrays import opaque_index, owned
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .lights import LIGHTS
-from .tessellate import children, parts
+from .tessellate import UNMESHED, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
@@ -18,13 +18,6 @@ CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum",
 POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
 AT_ONCE = 1 << 22  # samples in one launch
-UNMESHED = {  # classes of Mitsuba's shapes that there is no mesher for
-    "BSplineCurve": "curves",
-    "LinearCurve": "curves",
-    "SDFGrid": "signed distance fields",
-    "Ellipsoids": "ellipsoids",
-    "EllipsoidsMesh": "ellipsoids",
-}
 
 
 class Materials:

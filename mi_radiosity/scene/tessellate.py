@@ -14,6 +14,13 @@ from ..core.plugins import Registry
 FEWEST, MOST = 12, 72  # segments around a shape
 OUTLINE = 1 / 2000  # of the size of the scene: by how much a silhouette may miss
 MESHERS = Registry("shape")
+UNMESHED = {  # classes of Mitsuba's shapes that there is no mesher for
+    "BSplineCurve": "curves",
+    "LinearCurve": "curves",
+    "SDFGrid": "signed distance fields",
+    "Ellipsoids": "ellipsoids",
+    "EllipsoidsMesh": "ellipsoids",
+}
 
 
 def mesher(shape_class: str) -> Callable:
@@ -45,7 +52,8 @@ class Part:
     @property
     def can_mesh(self) -> bool:
         """Is it a mesh, or is there a mesher for it?"""
-        return isinstance(self.shape, mi.Mesh) or self.shape.class_name() in MESHERS
+        kind = self.shape.class_name()
+        return kind in MESHERS or (isinstance(self.shape, mi.Mesh) and kind not in UNMESHED)
 
 
 def label(shape, index) -> str:
