@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.errors import RadiosityError
 from ..core.arrays import opaque_index, owned
+from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .lights import LIGHTS
 from .tessellate import UNMESHED, children, parts
