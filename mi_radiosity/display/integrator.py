@@ -98,9 +98,13 @@ def _integrator_class():
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
             reflectance = _reflectance(model, prelim, ray, hit, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
-            emission = dr.gather(mi.Color3f, model.patches.emission, hit.patch, emits)
+            emission = model.lights.seen(model.patches, hit, emits)
             look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
+            if model.lights.has_sky and not self.hide_emitters:
+                direction = ray.d if rays.lobes is None else hit.direction
+                radiance += model.lights.sky(direction, active & ~hit.valid) * dr.inv_pi
+                valid |= active
             if rays.lobes is not None:
                 radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
                 valid |= active & hit.bounced
