@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
+from .export.commands_measure import add_measure
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
@@ -63,6 +64,7 @@ def _parser() -> Parser:
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
+    add_measure(commands, _solution_arguments, progress_bars)
     return parser
 
 
@@ -71,8 +73,18 @@ def _parser() -> Parser:
 
 
 def _scene_arguments(parser):
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
+    _loading_arguments(parser)
+
+
+def _solution_arguments(parser):
+    parser.add_argument("solution", type=Path, metavar="SOLUTION.npz", help="what render --save has kept")
+    parser.add_argument("--scene", type=Path, required=True, metavar="SCENE", help="the Mitsuba XML file it is of")
+    _loading_arguments(parser)
+
+
+def _loading_arguments(parser):
     add = parser.add_argument
-    add("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
     add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
     add(
         "-D",
@@ -121,7 +133,7 @@ def _solve_arguments(group):
 
 
 def _shading_argument(parser):
-    names = "gouraud, flat, mesh or a plugin's (default gouraud)"
+    names = "gouraud, flat, mesh, lux or a plugin's (default gouraud)"
     parser.add_argument("--shading", default="gouraud", metavar="NAME", help=names)
 
 
@@ -187,7 +199,7 @@ def _definition(text):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import write_image
+    from .display import SHADERS, Shader, write_image
 
     options = _solve_options(arguments)
     for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
@@ -202,6 +214,9 @@ def _render(arguments: argparse.Namespace) -> None:
             image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
             write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
+    shader: type[Shader] = SHADERS.find(arguments.shading)
+    if legend := shader.legend(solution):
+        print(legend)
     s = solution.stats
     print(
         f"{s['elements']:,} elements, {s['pairs']:,} pairs, {s['rays']:,} rays, {s['oracle_rays']:,} oracle rays, "

@@ -101,7 +101,7 @@ def find_overlaps(faces, present, exitance, reflectance, tolerance) -> Overlaps:
 
 def _precedence(faces, present, exitance, reflectance):
     """Place of every side in the order in which points belong to sides (int [2 · faces])."""
-    surface = _surfaces(faces.corners, faces.normal)
+    surface = surfaces(faces.corners, faces.normal)
     size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
     first = np.full(surface.max() + 1, len(faces))
     np.minimum.at(first, surface, faces.rank)
@@ -193,8 +193,9 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
             yield f[near], g[near]
 
 
-def _surfaces(corners, normal):
-    """A number per face, the same for faces joined by edges, within one plane, that they run along in opposite directions (int [faces])."""
+def surfaces(corners, normal):
+    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions
+    (int [faces])."""
     n = len(corners)
     _, vertex = np.unique(np.round(corners.reshape(-1, 3), 12), axis=0, return_inverse=True)
     vertex = vertex.reshape(n, 3).astype(np.int64)

@@ -33,7 +33,7 @@ class Field:
         leaves = self._elements.leaves
         H = dr.gather(mi.Color3f, self.flat, leaves)
         self._vertices = Vertices(solution.model, self._elements)
-        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0)
+        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0) | self._nodes_behind_walls(leaves)
         values = self._spread(H)
         for _ in range(SHARPEN):
             lost = dr.select(self._dark_nodes == 0, H - self._mean(values), 0)
@@ -114,6 +114,21 @@ class Field:
         dr.scatter(dark, bits, chosen)
         dr.eval(dark)
         return dark
+
+    def _nodes_behind_walls(self, leaves):
+        """Nodes of leaves whose vertex stands on the other side of a wall, where leaves of one plane meet, a bit for
+        each (UInt32 [leaves])."""
+        patches, bits = self._elements.patches, dr.zeros(mi.UInt32, dr.width(leaves))
+        normal = dr.gather(mi.Vector3f, patches.normal, dr.gather(mi.UInt32, self._elements.patch, leaves))
+        for node, vertex in enumerate((*self._vertices.corner, *self._vertices.middle)):
+            index = dr.gather(mi.UInt32, vertex, leaves)
+            there = dr.gather(mi.Point3f, self._vertices.point, index, index != NONE)
+            here = node_point(self._elements, leaves, node)
+            level = (index != NONE) & (dr.abs(dr.dot(there - here, normal)) < 0.25 * patches.lift)
+            hidden = self._rays.blocked(here, there, level)
+            bits |= dr.select(hidden, mi.UInt32(1 << node), 0)
+        dr.eval(bits)
+        return bits
 
     def _spread(self, H):
         """Vertex values from leaf values: averages over the leaves around (Color3f [vertices]).

@@ -1,0 +1,1 @@
+"""A solution taken home: measured, and exported for those who have nothing of this package."""
