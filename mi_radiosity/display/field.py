@@ -60,6 +60,11 @@ class Field:
         """Which leaves does a wall stand on (Bool [elements])?"""
         return self._walled
 
+    @property
+    def of_leaves(self):
+        """H of the leaves themselves (Color3f [leaves])."""
+        return dr.gather(mi.Color3f, self.flat, self._elements.leaves)
+
     # ---- Looking up ----------------------------------------------------------------------------
 
     def at(self, leaf, u, v, active=True):

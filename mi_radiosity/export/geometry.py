@@ -1,16 +1,20 @@
 """The lit mesh: welded triangles of a solution, for whoever shows them without this package."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, owned
+from ..core.arrays import owned
 from ..display import Field
 from ..mesh.subdivision import NODES
-from ..scene.materials import is_textured
+from ..scene.materials import is_diffuse, is_textured
 from ..solver import Solution
+from .cutting import cut, sides_of
+from .walls import beside_walls
+
+APART = 0.02  # how far, relatively, a value beside a wall may be from that of its vertex and still be welded to it
 
 
 @dataclass(frozen=True)
@@ -18,8 +22,8 @@ class LitMesh:
     """Triangles with the Gouraud field of a solution at their vertices; NumPy arrays, one row each.
 
     A leaf is one triangle, or is cut at the vertices that hang on its sides, so that triangles of one surface meet
-    along whole sides. Vertices are shared within a side of a shape, where they share a shading normal and a texture's
-    coordinates. Triangles are counter-clockwise as seen from the side that is lit.
+    along whole sides. Vertices are shared within a side of a shape, where they share a shading normal, a texture's
+    coordinates and, beside walls, their light. Triangles are counter-clockwise as seen from the side that is lit.
     """
 
     vertices: np.ndarray  # [vertices, 3] m, in the coordinates of the scene
@@ -29,9 +33,10 @@ class LitMesh:
     reflectance: np.ndarray  # [vertices, 3] ρ, the mean over the leaves around
     emission: np.ndarray  # [vertices, 3] E, W/m²
     uv: np.ndarray  # [vertices, 2] coordinates of the shape's texture, NaN where it has none
-    leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution
+    leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution, −1 where no light comes
     shape: np.ndarray  # [triangles] number of the shape in scene.shapes()
     back: np.ndarray  # [triangles] bool: the back of the shape
+    above: np.ndarray  # [triangles] bool: another lit side lies in the same plane, below it
 
     @property
     def irradiance(self) -> np.ndarray:
@@ -43,6 +48,15 @@ class LitMesh:
         """B = E + ρ H, W/m² [vertices, 3]."""
         return self.emission + self.reflectance * self.irradiance
 
+    def raised(self, by: float) -> np.ndarray:
+        """``vertices``, those of the triangles ``above`` lifted off the plane, m [vertices, 3]."""
+        a, b, c = (self.vertices[self.triangles[self.above, k]] for k in range(3))
+        normal = np.zeros_like(self.vertices)
+        for k in range(3):
+            np.add.at(normal, self.triangles[self.above, k], np.cross(b - a, c - a))
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return self.vertices + by * normal / np.where(length > 0, length, 1)
+
     def areas(self) -> np.ndarray:
         """Areas of the triangles, m² [triangles]."""
         a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
@@ -50,98 +64,80 @@ class LitMesh:
 
 
 def lit_mesh(solution: Solution) -> LitMesh:
-    """The triangles of a solution, with the values of its Gouraud picture."""
-    field = Field(solution)
-    total = _known(solution, field, field.flat)
-    first = replace(solution, indirect=dr.zeros(mi.Color3f, len(solution.elements)))
-    direct = np.minimum(_known(solution, Field(first), solution.direct), total)
-    vertices, elements, model = field.vertices, solution.elements, solution.model
-    leaves = np.array(elements.leaves)
-    corner = np.array(vertices.corner).reshape(3, -1).T
-    triangles, leaf = cut(corner[leaves], _sides(vertices, elements))
-    patch = np.array(elements.patch)[leaves[leaf]]
-    face, back = np.array(model.patches.face)[patch], np.array(model.patches.back).astype(bool)[patch]
-    shape, points = model.faces.shape[face], _points(model, elements, corner, vertices.count)
-    uv = _texture_coordinates(model, face, points[triangles])
+    """The triangles of a solution, with the values of its Gouraud picture, and the opaque faces that no light reaches.
 
-    key = np.column_stack([triangles.ravel(), np.repeat(2 * shape + back, 3), _rounded(uv)])
-    _, first_of, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    old, number = triangles.ravel()[first_of], number.reshape(-1, 3)
+    Mirrors and glass, as far as they have no diffuse lobe, are left out or black: nothing can be baked of them.
+    """
+    mesh, dark = _lit(solution), _dark_faces(solution.model)
+    n, corners = len(dark), solution.model.faces.corners[dark].reshape(-1, 3)
+    none, black = np.zeros(n, dtype=bool), np.zeros((3 * n, 3))
+    more = LitMesh(
+        corners,
+        np.arange(3 * n).reshape(n, 3) + len(mesh.vertices),
+        *4 * [black],
+        np.full((3 * n, 2), np.nan),
+        np.full(n, -1),
+        solution.model.faces.shape[dark],
+        none,
+        none,
+    )
+    return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
+
+
+def _dark_faces(model):
+    """Numbers of opaque faces neither side of which is a patch or lies under one."""
+    faces, known = model.faces, np.zeros(len(model.faces), dtype=bool)
+    known[np.array(model.patches.face)] = True
+    if model.rays.overlaps:
+        known[model.rays.overlaps.under // 2] = True
+    clear = [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in model.scene.shapes()]
+    return np.flatnonzero(~known & ~faces.degenerate & ~np.array(clear)[faces.shape])
+
+
+def _lit(solution):
+    elements, model = solution.elements, solution.model
+    none = dr.zeros(mi.Color3f, len(elements))
+    layers = [Field(solution), Field(replace(solution, indirect=none))]
+    vertices, leaves = layers[0].vertices, np.array(elements.leaves)
+    corner = np.array(vertices.corner).reshape(3, -1).T
+    pieces, of = cut(corner[leaves].astype(np.int64), sides_of(vertices, elements))
+    table = np.hstack([_points(model, elements, corner, vertices.count), *(_known(f, corner[leaves]) for f in layers)])
+    table, pieces, of, values, beside = beside_walls(solution, layers, table, pieces, of)
+    values[..., 3:] = np.minimum(values[..., 3:], values[..., :3])
+
+    patch = np.array(elements.patch)[leaves[of]]
+    face, back = np.array(model.patches.face)[patch], np.array(model.patches.back).astype(bool)[patch]
+    shape = model.faces.shape[face]
+    uv = _texture_coordinates(model, face, table[pieces, :3])
+    own = beside[:, None] & (np.abs(values - table[pieces, 3:]) > APART * (values + values.mean())).any(axis=2)
+    step = np.round(np.log(values + values.mean() / 100) / APART).astype(np.int64)
+    apart = np.where(own[..., None], step, np.iinfo(np.int64).max).reshape(-1, 6)
+    key = [pieces.ravel(), np.repeat(2 * shape + back, 3), *apart.T, *_rounded(uv)]
+    first, number = _unique(key)
+    number, values = number.reshape(-1, 3), values.reshape(-1, 6)[first]
     turned = (back ^ model.faces.flipped[face])[:, None]
-    rho, emission = _rows(elements.reflectance)[leaves[leaf]], _rows(model.patches.emission)[patch]
+    rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(model.patches.emission)[patch]
     return LitMesh(
-        vertices=points[old],
+        vertices=table[pieces.ravel()[first], :3],
         triangles=np.where(turned, number[:, ::-1], number),
-        direct=direct[old],
-        indirect=total[old] - direct[old],
-        reflectance=_around(number, rho, len(old)),
-        emission=_around(number, emission, len(old)),
-        uv=uv.reshape(-1, 2)[first_of],
-        leaf=leaf,
+        direct=values[:, 3:],
+        indirect=values[:, :3] - values[:, 3:],
+        reflectance=_around(number, rho, len(first)),
+        emission=_around(number, emission, len(first)),
+        uv=uv.reshape(-1, 2)[first],
+        leaf=of,
         shape=shape,
         back=back,
+        above=_above(model, face, back),
     )
 
 
-def cut(triangles: np.ndarray, sides: "Sides") -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles until no side has a vertex in its middle: the pieces [n, 3] and which triangle each is of [n].
-
-    What a triangle becomes depends on its sides alone, so neighbours fit.
-    """
-    done, of = [], []
-    number = np.arange(len(triangles))
-    while len(triangles):
-        middle = np.stack([sides.middle(triangles[:, k - 2], triangles[:, k - 1]) for k in range(3)], axis=1)
-        bent = middle != NONE
-        count = bent.sum(axis=1)
-        # Turn them, so that the only bent side is opposite corner 0, or the only straight one.
-        turn = np.where(count == 1, bent.argmax(axis=1), np.where(count == 2, (~bent).argmax(axis=1), 0))
-        order = (np.arange(3) + turn[:, None]) % 3
-        nodes = np.concatenate([np.take_along_axis(x, order, axis=1) for x in (triangles, middle)], axis=1)
-        done.append(triangles[count == 0])
-        of.append(number[count == 0])
-        pieces = [(nodes[count == n][:, piece], number[count == n]) for n in PIECES for piece in PIECES[n]]
-        triangles, number = (np.concatenate(parts) for parts in zip(*pieces))
-    done, of = np.concatenate(done), np.concatenate(of)
-    order = np.argsort(of, kind="stable")
-    return done[order], of[order]
-
-
-# Pieces of a triangle by how many of its sides have a middle, as nodes: corners 0 to 2, middles opposite them 3 to 5.
-PIECES = {
-    1: ([0, 1, 3], [0, 3, 2]),
-    2: ([0, 5, 4], [5, 1, 2], [5, 2, 4]),
-    3: ([0, 5, 4], [5, 1, 3], [4, 3, 2], [3, 4, 5]),
-}
-
-
-class Sides:
-    """The vertex in the middle of a side, by the two at its ends."""
-
-    def __init__(self, low, high, middle):
-        self._keys, first = np.unique(_side_keys(low, high), return_index=True)
-        self._middle = middle[first]
-
-    def middle(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Numbers of vertices, NONE where there is none [n]."""
-        if not len(self._keys):
-            return np.full(len(a), NONE)
-        key = _side_keys(a, b)
-        at = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
-        return np.where(self._keys[at] == key, self._middle[at], NONE)
-
-
-def _side_keys(a, b):
-    return (np.minimum(a, b).astype(np.uint64) << np.uint64(32)) | np.maximum(a, b).astype(np.uint64)
-
-
-def _sides(vertices, elements) -> Sides:
-    """Every side of the mesh that is split on either side of it."""
-    corner, middle = (np.array(x).reshape(3, -1) for x in (vertices.corner, vertices.middle))
-    ends = [(corner[k - 2], corner[k - 1], middle[k]) for k in range(3)]
-    low, high, vertex = (np.concatenate(parts) for parts in zip(*ends))
-    split = vertex != NONE
-    return Sides(low[split], high[split], vertex[split])
+def _above(model, face, back):
+    """Which sides of faces lie on others, or on their own front."""
+    both, sides = np.zeros(len(model.faces)), 2 * face + back
+    np.add.at(both, np.array(model.patches.face), 1)
+    overlaps = model.rays.overlaps
+    return (back & (both[face] > 1)) | (np.isin(sides, overlaps.over) if overlaps else False)
 
 
 def _points(model, elements, corner, count):
@@ -156,48 +152,55 @@ def _points(model, elements, corner, count):
     return points
 
 
-def _known(solution, field, flat):
+def _known(field, leaf_corners):
     """Values of the vertices [vertices, 3]; where nothing is known of one, the mean of the leaves around."""
     values = _rows(field.values)
     unknown = np.isnan(values[:, 0])
     if unknown.any():
-        leaves = np.array(solution.elements.leaves)
-        corner = np.array(field.vertices.corner).reshape(3, -1).T[leaves]
-        values[unknown] = _around(corner, _rows(flat)[leaves], len(values))[unknown]
+        values[unknown] = _around(leaf_corners, _rows(field.of_leaves), len(values))[unknown]
     return values
 
 
 def _around(triangles, values, count):
     """Means, at vertices, of values of the triangles around [count, 3]."""
-    sums, index = np.zeros((count, 3)), triangles.ravel()
-    for channel in range(3):
-        sums[:, channel] = np.bincount(index, np.repeat(values[:, channel], 3), count)
-    return sums / np.maximum(np.bincount(index, minlength=count), 1)[:, None]
+    index = triangles.ravel()
+    sums = [np.bincount(index, np.repeat(column, 3), count) for column in values.T]
+    return np.column_stack(sums) / np.maximum(np.bincount(index, minlength=count), 1)[:, None]
 
 
 def _texture_coordinates(model, face, points):
-    """UV of corners of triangles on faces, where their shapes are textured [triangles, 3, 2]."""
+    """UV of the corners of pieces of faces, where their shapes are textured [pieces, 3, 2]."""
     faces, uv = model.faces, np.full((len(face), 3, 2), np.nan)
-    textured = np.array([is_textured(s.bsdf()) for s in model.scene.shapes()], dtype=bool)
+    textured = [is_textured(s.bsdf()) and is_diffuse(s.bsdf()) for s in model.scene.shapes()]
     for number in np.flatnonzero(textured):
         chosen = np.flatnonzero(faces.shape[face] == number)
-        f = np.repeat(face[chosen], 3)
-        u, v = _barycentric(faces, f, points[chosen].reshape(-1, 3))
-        si = faces.surface(owned(mi.UInt32, f), owned(mi.Float, u), owned(mi.Float, v))
+        of = np.repeat(face[chosen], 3)
+        u, v = barycentric(faces.corners[of], points[chosen].reshape(-1, 3))
+        si = faces.surface(*(owned(kind, x) for kind, x in ((mi.UInt32, of), (mi.Float, u), (mi.Float, v))))
         uv[chosen] = np.array(si.uv).T.reshape(-1, 3, 2)
     return uv
 
 
-def _barycentric(faces, face, points):
-    """(u, v) of points in the planes of faces (two float [n])."""
-    e1, e2 = faces.e1[face], faces.e2[face]
-    x, normal = points - faces.corners[face, 0], np.cross(e1, e2)
+def barycentric(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) of points [n, 3] in triangles [n, 3, 3] (two float [n])."""
+    e1, e2, x = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    normal = np.cross(e1, e2)
     n2 = (normal**2).sum(axis=1)
     return (np.cross(x, e2) * normal).sum(axis=1) / n2, (np.cross(e1, x) * normal).sum(axis=1) / n2
 
 
+def _unique(columns):
+    """The first row of each kind, and the kind of every row, of a table of integers."""
+    order = np.lexsort(columns)
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = np.any([column[order][1:] != column[order][:-1] for column in columns], axis=0)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.cumsum(new) - 1
+    return order[new], number
+
+
 def _rounded(uv):
-    return np.round(np.nan_to_num(uv) * 2**16).astype(np.int64).reshape(-1, 2)
+    return list(np.round(np.nan_to_num(uv) * 2**16).astype(np.int64).reshape(-1, 2).T)
 
 
 def _rows(color):

@@ -99,8 +99,11 @@ def _tracing_scene(scene):
     shapes = scene.shapes()
     if all(isinstance(shape, mi.Mesh) for shape in shapes):
         return scene
-    meshes = {f"shape_{i}": as_mesh(shape) for i, shape in enumerate(shapes)}
-    return mi.load_dict({"type": "scene"} | meshes, optimize=False)
+    meshes, names = {f"shape_{i}": as_mesh(shape) for i, shape in enumerate(shapes)}, [shape.id() for shape in shapes]
+    tracing = mi.load_dict({"type": "scene"} | meshes, optimize=False)
+    for shape, name in zip(shapes, names):  # which load_dict has changed
+        shape.set_id(name)
+    return tracing
 
 
 def _corners(scene):
