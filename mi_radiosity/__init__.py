@@ -9,6 +9,8 @@ import mitsuba as _mi
 from .core.errors import RadiosityError
 from .display import Shader
 from .display import register as _register
+from .export import export
+from .export import view as _view
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
 from .solver import Solution, solve
@@ -30,10 +32,12 @@ __all__ = [
     "Solution",
     "Transport",
     "Uniform",
+    "export",
     "information_gap",
     "mesher",
     "solve",
 ]
 
+Solution.view = _view  # type: ignore[attr-defined]  # rooms below do not know of this one
 _register()
 _mi.detail.add_variant_callback(_register)

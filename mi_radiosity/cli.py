@@ -5,12 +5,15 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
+from .export.commands import add_commands as add_export_commands
+from .export.commands import recall_scene
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
@@ -63,6 +66,7 @@ def _parser() -> Parser:
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
+    add_export_commands(commands, _loading_arguments, progress_bars)
     return parser
 
 
@@ -71,8 +75,12 @@ def _parser() -> Parser:
 
 
 def _scene_arguments(parser):
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
+    _loading_arguments(parser)
+
+
+def _loading_arguments(parser):
     add = parser.add_argument
-    add("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
     add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
     add(
         "-D",
@@ -235,7 +243,7 @@ def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[st
 def _keep(arguments: argparse.Namespace, solution: "Solution") -> None:
     """Write what was asked for beside pictures."""
     if arguments.save:
-        solution.save(arguments.save)
+        solution.save(arguments.save, asdict(arguments.file))
     if arguments.stats:
         with writing(arguments.stats) as temporary:
             Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
@@ -385,6 +393,7 @@ def _prepare(arguments: argparse.Namespace) -> None:
     from .evaluation.scenes import scene_file
 
     mi.set_log_level(mi.LogLevel.Error)
+    recall_scene(arguments)
     arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
     if "shading" in arguments:

@@ -1,7 +1,6 @@
 """A Mitsuba scene that shines by itself as the solution does: any Mitsuba shows it, with any integrator."""
 
 import os
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,11 +12,8 @@ from .geometry import LitMesh
 from .ply import write_ply
 
 
-def write_xml(mesh: LitMesh, path: str | os.PathLike[str], views: list[Camera], lift: float) -> None:
-    """Write the scene, and its mesh beside it as .ply: a black surface that emits B / π.
-
-    lift: how far apart sides are in one plane, m.
-    """
+def write_xml(mesh: LitMesh, path: str | os.PathLike[str], views: list[Camera]) -> None:
+    """Write the scene, and its mesh beside it as .ply: a black surface that emits B / π."""
     path = Path(path)
     scene = ElementTree.Element("scene", version="3.0.0")
     integrator = _add(scene, "integrator", type="path")
@@ -32,7 +28,7 @@ def write_xml(mesh: LitMesh, path: str | os.PathLike[str], views: list[Camera], 
     _add(texture, "string", name="name", value="vertex_radiosity_color")
     _add(texture, "float", name="scale", value=repr(1 / np.pi))
     ElementTree.indent(scene, "    ")
-    write_ply(replace(mesh, vertices=mesh.raised(lift)), path.with_suffix(".ply"), exposure=None)
+    write_ply(mesh, path.with_suffix(".ply"), exposure=None)
     with writing(path) as temporary:
         ElementTree.ElementTree(scene).write(temporary, encoding="utf-8", xml_declaration=True)
 

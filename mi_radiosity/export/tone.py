@@ -1,8 +1,13 @@
 """From radiance to what screens and viewers take."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..core.errors import RadiosityError
+
+if TYPE_CHECKING:
+    from .geometry import LitMesh
 
 BRIGHT = 0.98  # share of the lit area that the exposure "auto" shows without clipping
 
@@ -13,19 +18,23 @@ def srgb8(linear: np.ndarray) -> np.ndarray:
     return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 
-def exposure_of(mesh, exposure: float | str) -> float:
-    """A number > 0, or "auto": then what brings 98 % of the area that is no lamp below 1.
+def checked(exposure: float | str) -> float | str:
+    """A number > 0, or "auto". Raises RadiosityError for anything else."""
+    if exposure == "auto":
+        return "auto"
+    try:
+        value = float(exposure)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
+    return value
 
-    Raises RadiosityError for anything else.
-    """
+
+def exposure_of(mesh: "LitMesh", exposure: float | str) -> float:
+    """The number itself; for "auto" what brings 98 % of the area that is no lamp below 1."""
     if exposure != "auto":
-        try:
-            value = float(exposure)
-        except ValueError:
-            value = 0.0
-        if not 0 < value < float("inf"):
-            raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
-        return value
+        return float(exposure)
     brightest = (mesh.radiosity / np.pi).max(axis=1)[mesh.triangles].max(axis=1)
     lamp = mesh.emission.max(axis=1)[mesh.triangles].max(axis=1) > 0
     weight = np.where(lamp, 0, mesh.areas())
