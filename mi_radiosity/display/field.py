@@ -23,7 +23,8 @@ class Field:
     Where a wall stands on a leaf, each side of it is shown by the nodes on that side that light came down in sight
     of; and where there is none, by the leaf's own value if light came down in sight of the point itself.
 
-    vertices: the Vertices of the mesh, with values (Color3f [vertices]). nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
+    vertices: the Vertices of the mesh, with values (Color3f [vertices]). nodes: six Color3f per element,
+    [6 · elements]. NaN for those that nothing is known of.
     """
 
     def __init__(self, solution):

@@ -9,7 +9,7 @@ from ..core.errors import RadiosityError
 from ..core.files import check_writable
 from ..solver import Solution
 from .cameras import cameras
-from .geometry import LitMesh, lit_mesh
+from .geometry import RAISE, LitMesh, lit_mesh
 from .gltf import write_glb
 from .mitsuba_xml import write_xml
 from .ply import write_ply
@@ -21,7 +21,7 @@ def _ply(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None
 
 
 def _glb(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None:
-    write_glb(mesh, path, solution.model.scene, exposure)
+    write_glb(replace(mesh, vertices=mesh.raised(RAISE * mesh.size)), path, solution.model.scene, exposure)
 
 
 def _xml(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None:

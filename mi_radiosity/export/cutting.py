@@ -3,6 +3,8 @@
 import numpy as np
 
 from ..core.arrays import NONE
+from ..mesh import Elements
+from ..mesh.vertices import Vertices
 
 # Pieces of a triangle by how many of its sides have a middle, as nodes: corners 0 to 2, middles opposite them 3 to 5.
 PIECES = {
@@ -33,7 +35,7 @@ def keys(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (np.minimum(a, b).astype(np.uint64) << np.uint64(32)) | np.maximum(a, b).astype(np.uint64)
 
 
-def sides_of(vertices, elements) -> Sides:
+def sides_of(vertices: Vertices, elements: Elements) -> Sides:
     """The sides of a mesh that are split on one side of them or the other."""
     corner, middle = (np.array(x).reshape(3, -1) for x in (vertices.corner, vertices.middle))
     ends = [(corner[k - 2], corner[k - 1], middle[k]) for k in range(3)]

@@ -16,6 +16,8 @@ from .walls import beside_walls
 
 APART = 0.02  # how far, relatively, a value beside a wall may be from that of its vertex and still be welded to it
 
+RAISE = 1e-4  # of the diagonal of its box: how far apart a mesh has sides in one plane on screens
+
 
 @dataclass(frozen=True)
 class LitMesh:
@@ -48,6 +50,11 @@ class LitMesh:
         """B = E + ρ H, W/m² [vertices, 3]."""
         return self.emission + self.reflectance * self.irradiance
 
+    @property
+    def size(self) -> float:
+        """The diagonal of the box around it, m."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
     def raised(self, by: float) -> np.ndarray:
         """``vertices``, those of the triangles ``above`` lifted off the plane, m [vertices, 3]."""
         a, b, c = (self.vertices[self.triangles[self.above, k]] for k in range(3))
@@ -74,7 +81,10 @@ def lit_mesh(solution: Solution) -> LitMesh:
     more = LitMesh(
         corners,
         np.arange(3 * n).reshape(n, 3) + len(mesh.vertices),
-        *4 * [black],
+        black,
+        black,
+        black,
+        black,
         np.full((3 * n, 2), np.nan),
         np.full(n, -1),
         solution.model.faces.shape[dark],
@@ -190,13 +200,14 @@ def barycentric(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _unique(columns):
-    """The first row of each kind, and the kind of every row, of a table of integers."""
+    """The first row of each kind, in order, and the kind of every row, of a table of integers given by columns."""
     order = np.lexsort(columns)
     new = np.ones(len(order), dtype=bool)
     new[1:] = np.any([column[order][1:] != column[order][:-1] for column in columns], axis=0)
-    number = np.empty(len(order), dtype=np.int64)
-    number[order] = np.cumsum(new) - 1
-    return order[new], number
+    first, number = order[new], np.empty(len(order), dtype=np.int64)
+    place = np.argsort(np.argsort(first))
+    number[order] = place[np.cumsum(new) - 1]
+    return np.sort(first), number
 
 
 def _rounded(uv):

@@ -18,8 +18,8 @@ VERTICES, INDICES = 34962, 34963  # buffer view targets
 def write_glb(mesh: LitMesh, path: str | os.PathLike[str], scene: "mi.Scene", exposure: float = 1.0) -> None:
     """Write the mesh, a node per shape, turned so that +y is up, and the scene's cameras.
 
-    COLOR_0: radiance times ``exposure``, clipped to [0, 1], linear; where a shape is textured, what its texture, the base
-    colour, is multiplied by. _RADIOSITY and _IRRADIANCE: float32, W/m². extras: the exposure.
+    COLOR_0: radiance times ``exposure``, clipped to [0, 1], linear; where a shape is textured, what its texture, the
+    base colour, is multiplied by. _RADIOSITY and _IRRADIANCE: float32, W/m². extras: the exposure.
     """
     file = _File()
     root = file.gltf.nodes
@@ -49,7 +49,7 @@ def write_glb(mesh: LitMesh, path: str | os.PathLike[str], scene: "mi.Scene", ex
 class _File:
     """A glTF file that grows."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         try:
             import pygltflib
         except ImportError:

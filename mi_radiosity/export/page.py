@@ -16,12 +16,11 @@ from ..core.files import check_writable, writing
 from ..solver import Solution
 from ..solver.solution import LUMENS_PER_WATT, LUMINANCE
 from .cameras import cameras, up
-from .geometry import LitMesh, lit_mesh
+from .geometry import RAISE, LitMesh, lit_mesh
 from .textures import png, textures
 from .tone import checked, exposure_of
 
-GRID = 2**20  # steps that the longest side of a scene's box is quantised to
-RAISE = 1e-4  # of that side: how far apart sides in one plane are drawn
+GRID = 2**20  # steps that the diagonal of a scene's box is quantised to
 LAYERS = ("direct", "indirect")
 
 Report = Callable[[str, int, int | None], None]
@@ -75,13 +74,13 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
     """What view.js reads: arrays of vertices, triangles and leaves, and what there is once."""
     scene, flat = solution.model.scene, solution.leaves()
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    size = float(np.linalg.norm(high - low))
+    size = mesh.size
     pictures = textures(mesh, scene)
     order, parts = _parts(mesh, scene, list(pictures))
     light, leaf_light = (mesh.direct, mesh.indirect), _flat(solution)
     unit = max(float(max(x.max() for x in (*light, mesh.emission))), 1e-30) / 2**15  # so that halves suffice
     arrays = {
-        "places": _packed(np.round((mesh.raised(RAISE * size) - low) / (size / GRID)).astype(np.uint32) + 0),
+        "places": _packed(np.round((mesh.raised(RAISE * size) - low) / (size / GRID)).clip(0).astype(np.uint32)),
         "triangles": _packed(mesh.triangles[order].astype(np.uint32)),
         "inner": _packed(_inner(mesh)[order], deltas=False),
         "leaf": _packed(np.where(mesh.leaf < 0, len(flat), mesh.leaf)[order, None].astype(np.uint32)),
@@ -113,7 +112,7 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
 
 def _parts(mesh, scene, textured):
     """The order in which triangles are drawn, and runs of them with one name and texture."""
-    kinds, first, number = np.unique(2 * mesh.shape + mesh.back, return_index=True, return_inverse=True)
+    _, first, number = np.unique(2 * mesh.shape + mesh.back, return_index=True, return_inverse=True)
     order, counts = np.argsort(number, kind="stable"), np.bincount(number)
     parts, start = [], 0
     for at, count in zip(first.tolist(), counts.tolist()):

@@ -12,8 +12,11 @@ LIGHT = ("irradiance", "radiosity")
 
 
 def write_ply(mesh: LitMesh, path: str | os.PathLike[str], exposure: float | None = 1.0) -> None:
-    """Write the mesh. Vertices have ``irradiance_r/g/b`` and ``radiosity_r/g/b``, W/m², and ``red, green, blue``: sRGB of
-    the radiance times ``exposure``, left out if that is None. Faces have the numbers of their leaf and shape."""
+    """Write the mesh.
+
+    Vertices have ``irradiance_r/g/b`` and ``radiosity_r/g/b``, W/m², and ``red, green, blue``: sRGB of the radiance
+    times ``exposure``, left out if that is None. Faces have the numbers of their leaf and shape.
+    """
     names = [*"xyz", *(f"{light}_{c}" for light in LIGHT for c in "rgb")]
     vertex = np.empty(len(mesh.vertices), [(name, "<f4") for name in names] + _colors(exposure))
     columns = np.hstack([mesh.vertices, mesh.irradiance, mesh.radiosity])

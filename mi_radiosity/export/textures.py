@@ -49,8 +49,15 @@ def _bake(bsdf, back, low, high):
     size = _resolution(bsdf, high - low)
     x, y = (k.ravel().astype(np.float32) for k in np.meshgrid(*(np.arange(n) + 0.5 for n in size)))
     si = dr.zeros(mi.SurfaceInteraction3f, x.size)
-    si.uv = mi.Point2f(*(mi.Float(a) for a in ((low[0] + x / size[0] * (high - low)[0]).astype(np.float32),
-                                               (high[1] - y / size[1] * (high - low)[1]).astype(np.float32))))
+    si.uv = mi.Point2f(
+        *(
+            mi.Float(a)
+            for a in (
+                (low[0] + x / size[0] * (high - low)[0]).astype(np.float32),
+                (high[1] - y / size[1] * (high - low)[1]).astype(np.float32),
+            )
+        )
+    )
     si.wi = mi.Vector3f(0, 0, -1.0 if back else 1.0)
     rho = np.array(mi.Color3f(bsdf.eval_diffuse_reflectance(si))).T.reshape(size[1], size[0], 3)
     return Texture(rho, low, high)

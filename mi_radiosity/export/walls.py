@@ -5,7 +5,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import owned
+from ..display import Field
 from ..mesh.exposure import is_covered
+from ..solver import Solution
 from .cutting import Sides, cut, keys
 
 ORDER = 4  # samples of a piece along a side
@@ -14,7 +16,9 @@ BREAK = 0.2  # relative error of a piece, root mean square, at which its light b
 PULL = 0.02  # of every corner towards the mean, in samples: for pieces of which hardly anything is open
 
 
-def beside_walls(solution, fields, table, pieces, of):
+def beside_walls(
+    solution: Solution, fields: list[Field], table: np.ndarray, pieces: np.ndarray, of: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Light at the corners of pieces [n, 3, channels], from the vertices, and for pieces ``beside`` walls [n] fitted to
     the field where the piece is open. Where that is too rough, pieces are cut further, with their neighbours.
 
@@ -44,7 +48,7 @@ def beside_walls(solution, fields, table, pieces, of):
 
 
 def _fit(solution, fields, table, pieces, leaf, values):
-    """Linear light on pieces, by least squares over their open points [n, 3, channels], and which it does not fit [n]."""
+    """Linear light on pieces [n, 3, channels], by least squares over their open points; which it does not fit [n]."""
     model, elements = solution.model, solution.elements
     i, j = (x.ravel() for x in np.indices((ORDER, ORDER)))
     i, j = i[i + j < ORDER], j[i + j < ORDER]

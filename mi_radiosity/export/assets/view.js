@@ -297,7 +297,9 @@ async function main() {
     geometry.setAttribute("place", new THREE.BufferAttribute(mesh.uv, 2));
     const materials = [material(null), ...textures.map(material)];
     for (const part of data.parts) geometry.addGroup(part.start, part.count, part.texture === null ? 0 : part.texture + 1);
-    const black = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color: 0, side: THREE.BackSide }));
+    // Backs are pushed away, lest they show along edges, where they meet fronts.
+    const offset = { polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 16 };
+    const black = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color: 0, side: THREE.BackSide, ...offset }));
     const scene = new THREE.Scene();
     for (const object of [new THREE.Mesh(geometry, materials), black]) {
         object.frustumCulled = false;
