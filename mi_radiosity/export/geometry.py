@@ -38,7 +38,7 @@ class LitMesh:
     leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution, −1 where no light comes
     shape: np.ndarray  # [triangles] number of the shape in scene.shapes()
     back: np.ndarray  # [triangles] bool: the back of the shape
-    above: np.ndarray  # [triangles] bool: another lit side lies in the same plane, below it
+    above: np.ndarray  # [triangles] how many lit sides lie in the same plane below it
 
     @property
     def irradiance(self) -> np.ndarray:
@@ -56,13 +56,16 @@ class LitMesh:
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     def raised(self, by: float) -> np.ndarray:
-        """``vertices``, those of the triangles ``above`` lifted off the plane, m [vertices, 3]."""
-        a, b, c = (self.vertices[self.triangles[self.above, k]] for k in range(3))
-        normal = np.zeros_like(self.vertices)
+        """``vertices``, those of triangles ``above`` others lifted off the plane, m for each [vertices, 3]."""
+        chosen = self.above > 0
+        corner, above = self.triangles[chosen], self.above[chosen]
+        a, b, c = (self.vertices[corner[:, k]] for k in range(3))
+        normal, height = np.zeros_like(self.vertices), np.zeros(len(self.vertices))
         for k in range(3):
-            np.add.at(normal, self.triangles[self.above, k], np.cross(b - a, c - a))
+            np.add.at(normal, corner[:, k], np.cross(b - a, c - a))
+            np.maximum.at(height, corner[:, k], above)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        return self.vertices + by * normal / np.where(length > 0, length, 1)
+        return self.vertices + by * height[:, None] * normal / np.where(length > 0, length, 1)
 
     def areas(self) -> np.ndarray:
         """Areas of the triangles, m² [triangles]."""
@@ -77,7 +80,7 @@ def lit_mesh(solution: Solution) -> LitMesh:
     """
     mesh, dark = _lit(solution), _dark_faces(solution.model)
     n, corners = len(dark), solution.model.faces.corners[dark].reshape(-1, 3)
-    none, black = np.zeros(n, dtype=bool), np.zeros((3 * n, 3))
+    black = np.zeros((3 * n, 3))
     more = LitMesh(
         corners,
         np.arange(3 * n).reshape(n, 3) + len(mesh.vertices),
@@ -88,8 +91,8 @@ def lit_mesh(solution: Solution) -> LitMesh:
         np.full((3 * n, 2), np.nan),
         np.full(n, -1),
         solution.model.faces.shape[dark],
-        none,
-        none,
+        np.zeros(n, dtype=bool),
+        np.zeros(n, dtype=np.int64),
     )
     return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
 
@@ -143,11 +146,15 @@ def _lit(solution):
 
 
 def _above(model, face, back):
-    """Which sides of faces lie on others, or on their own front."""
-    both, sides = np.zeros(len(model.faces)), 2 * face + back
-    np.add.at(both, np.array(model.patches.face), 1)
-    overlaps = model.rays.overlaps
-    return (back & (both[face] > 1)) | (np.isin(sides, overlaps.over) if overlaps else False)
+    """How many patches sides of faces lie on; a back lies on its own front."""
+    height, known = np.zeros(2 * len(model.faces), dtype=np.int64), np.zeros(2 * len(model.faces), dtype=bool)
+    known[2 * np.array(model.patches.face) + np.array(model.patches.back).astype(np.int64)] = True
+    height[1::2] = known[::2] & known[1::2]
+    overlaps, before = model.rays.overlaps, None
+    while overlaps and (before is None or (before != height).any()):
+        before, on_patch = height.copy(), known[overlaps.under]
+        np.maximum.at(height, overlaps.over[on_patch], before[overlaps.under[on_patch]] + 1)
+    return height[2 * face + back]
 
 
 def _points(model, elements, corner, count):
