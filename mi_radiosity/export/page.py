@@ -6,6 +6,7 @@ import json
 import os
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import resources
 from string import Template
 from typing import Any
@@ -43,12 +44,21 @@ def write_page(
         file.write(text)
 
 
-def view(solution: Solution, exposure: float | str = 1.0, height: int = 480) -> Any:
-    """The page within a notebook, as many pixels high (IPython's HTML)."""
-    from IPython.display import HTML
+@dataclass(frozen=True)
+class Frame:
+    """A page, as notebooks show it."""
 
-    text = html.escape(page(solution, exposure))
-    return HTML(f'<iframe srcdoc="{text}" style="width: 100%; height: {int(height)}px; border: 0"></iframe>')
+    page: str
+    height: int
+
+    def _repr_html_(self) -> str:
+        style = f"width: 100%; height: {self.height}px; border: 0"
+        return f'<iframe srcdoc="{html.escape(self.page)}" style="{style}"></iframe>'
+
+
+def view(solution: Solution, exposure: float | str = 1.0, height: int = 480) -> Frame:
+    """The page within a notebook, as many pixels high."""
+    return Frame(page(solution, exposure), int(height))
 
 
 def page(solution: Solution, exposure: float | str = 1.0, progress: Report | None = None) -> str:

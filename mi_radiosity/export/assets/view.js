@@ -149,6 +149,7 @@ class Walker {
         this.camera = camera;
         this.changed = changed;
         this.keys = new Set();
+        this.hurry = 1;
         this.touches = new Map();
         this.up = new THREE.Vector3(...data.up);
         this.speed = data.size / 8; // m/s
@@ -226,7 +227,7 @@ class Walker {
     }
 
     key(event, down) {
-        if (event.target.matches("select, input") && event.code.startsWith("Arrow")) return;
+        if (event.target.matches?.("select, input") && event.code.startsWith("Arrow")) return;
         if (event.ctrlKey || event.metaKey || event.altKey) return;
         if (down && event.code === "KeyH") document.body.classList.toggle("bare");
         this.keys[down ? "add" : "delete"](event.code);
