@@ -7,6 +7,7 @@ _choose_llvm()  # before anything imports drjit
 import mitsuba as _mi
 
 from .core.errors import RadiosityError
+from .core.plugins import welcome_installed as _welcome_installed
 from .display import Shader
 from .display import register as _register
 from .export import export
@@ -39,5 +40,12 @@ __all__ = [
 ]
 
 Solution.view = _view  # type: ignore[attr-defined]  # rooms below do not know of this one
-_register()
-_mi.detail.add_variant_callback(_register)
+
+def _follow_variant(*_: object) -> None:
+    if _mi.variant():
+        _register()
+        _welcome_installed()
+
+
+_follow_variant()
+_mi.detail.add_variant_callback(_follow_variant)

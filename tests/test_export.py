@@ -175,7 +175,9 @@ mi.set_variant("scalar_rgb")
 print(numpy.array(mi.render(mi.load_file(r"{tmp_path / "room.xml"}"), spp=16)).mean())"""
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
     assert run.returncode == 0, run.stderr
-    assert float(run.stdout.split()[-1]) == pytest.approx(np.array(solution.render(spp=64)).mean(), rel=0.02)
+    assert float(re.findall(r"[\d.]+", run.stdout)[-1]) == pytest.approx(
+        np.array(solution.render(spp=64)).mean(), rel=0.02
+    )
 
 
 def test_ply(solution, mesh, tmp_path):
@@ -239,7 +241,7 @@ def test_textures_stay_sharp(checkered, tmp_path):
     """The texture is the base colour, the light is in the vertices."""
     gltf = pytest.importorskip("pygltflib", reason="needs pygltflib: pip install 'mi_radiosity[export]'")
     mesh = lit_mesh(checkered)
-    (picture,) = textures(mesh, checkered.model.scene).values()
+    (picture,) = textures(mesh, checkered.model.faces.parts).values()
     rows = picture.image[[-1 - 512 // 12, 512 // 12]][:, 512 // 12, 0]  # the middle of two cells at the left border
     np.testing.assert_allclose(rows, [0.8, 0.1], atol=1e-6) if rows[0] > 0.5 else np.testing.assert_allclose(
         rows, [0.1, 0.8], atol=1e-6
@@ -272,21 +274,6 @@ def test_auto_exposure(solution, mesh):
     bright = (mesh.radiosity / np.pi).max(axis=1)[mesh.triangles].max(axis=1) * exposure_of(mesh, "auto")
     area = np.where(mesh.emission.max(axis=1)[mesh.triangles].max(axis=1) > 0, 0, mesh.areas())
     assert 0.975 < area[bright <= 1.0001].sum() / area.sum() < 0.99
-
-
-def test_names_of_shapes_stay():
-    """A scene that has to be traced as another keeps its own names."""
-    disk = {
-        "type": "disk",
-        "id": "bulb",
-        "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180),
-        "emitter": lamp(),
-    }
-    given = scene(optimize=False, bulb=disk, floor=rectangle(bsdf=diffuse()))
-    names = [shape.id() for shape in given.shapes()]
-    solution = mr.solve(given, elements=100, rays=5000)
-    assert [shape.id() for shape in given.shapes()] == names
-    solution.require_unchanged()
 
 
 # ---- Command line ----------------------------------------------------------------------------------

@@ -1,8 +1,10 @@
 """Parts that others add: classes known by a name, and the modules that define them."""
 
+import functools
 import importlib
 import importlib.metadata
 import runpy
+import warnings
 from pathlib import Path
 
 from .errors import RadiosityError
@@ -54,3 +56,12 @@ def load_installed() -> None:
     """Run the plugins that installed packages declare."""
     for entry in importlib.metadata.entry_points(group=GROUP):
         load(entry.value)
+
+
+@functools.cache
+def welcome_installed() -> None:
+    """`load_installed`, once; one that fails is a warning, so that it does not keep others from their work."""
+    try:
+        load_installed()
+    except RadiosityError as error:
+        warnings.warn(str(error), stacklevel=2)

@@ -21,7 +21,7 @@ def _ply(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None
 
 
 def _glb(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None:
-    write_glb(replace(mesh, vertices=mesh.raised(RAISE * mesh.size)), path, solution.model.scene, exposure)
+    write_glb(replace(mesh, vertices=mesh.raised(RAISE * mesh.size)), path, solution.model, exposure)
 
 
 def _xml(solution: Solution, mesh: LitMesh, path: Path, exposure: float) -> None:

@@ -1,16 +1,16 @@
 """The lit mesh: welded triangles of a solution, for whoever shows them without this package."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import owned
-from ..display import Field
 from ..mesh.subdivision import NODES
 from ..scene.materials import is_diffuse, is_textured
+from ..scene.tessellate import Part
 from ..solver import Solution
+from ..solver.field import Field
 from .cutting import cut, sides_of
 from .walls import beside_walls
 
@@ -36,7 +36,7 @@ class LitMesh:
     emission: np.ndarray  # [vertices, 3] E, W/m²
     uv: np.ndarray  # [vertices, 2] coordinates of the shape's texture, NaN where it has none
     leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution, −1 where no light comes
-    shape: np.ndarray  # [triangles] number of the shape in scene.shapes()
+    shape: np.ndarray  # [triangles] number of the shape among the parts of the scene, model.faces.parts
     back: np.ndarray  # [triangles] bool: the back of the shape
     above: np.ndarray  # [triangles] how many lit sides lie in the same plane below it
 
@@ -97,20 +97,25 @@ def lit_mesh(solution: Solution) -> LitMesh:
     return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
 
 
+def name_of(parts: list[Part], number: int) -> str:
+    """How files call a part of a scene."""
+    return parts[number].shape.id() or f"shape-{number}"
+
+
 def _dark_faces(model):
     """Numbers of opaque faces neither side of which is a patch or lies under one."""
     faces, known = model.faces, np.zeros(len(model.faces), dtype=bool)
     known[np.array(model.patches.face)] = True
     if model.rays.overlaps:
         known[model.rays.overlaps.under // 2] = True
-    clear = [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in model.scene.shapes()]
+    shapes = [part.shape for part in faces.parts]
+    clear = [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes]
     return np.flatnonzero(~known & ~faces.degenerate & ~np.array(clear)[faces.shape])
 
 
 def _lit(solution):
     elements, model = solution.elements, solution.model
-    none = dr.zeros(mi.Color3f, len(elements))
-    layers = [Field(solution), Field(replace(solution, indirect=none))]
+    layers = [solution.field, Field(solution, solution.direct)]
     vertices, leaves = layers[0].vertices, np.array(elements.leaves)
     corner = np.array(vertices.corner).reshape(3, -1).T
     pieces, of = cut(corner[leaves].astype(np.int64), sides_of(vertices, elements))
@@ -129,7 +134,7 @@ def _lit(solution):
     first, number = _unique(key)
     number, values = number.reshape(-1, 3), values.reshape(-1, 6)[first]
     turned = (back ^ model.faces.flipped[face])[:, None]
-    rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(model.patches.emission)[patch]
+    rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(elements.emission(elements.leaves))[of]
     return LitMesh(
         vertices=table[pieces.ravel()[first], :3],
         triangles=np.where(turned, number[:, ::-1], number),
@@ -188,7 +193,7 @@ def _around(triangles, values, count):
 def _texture_coordinates(model, face, points):
     """UV of the corners of pieces of faces, where their shapes are textured [pieces, 3, 2]."""
     faces, uv = model.faces, np.full((len(face), 3, 2), np.nan)
-    textured = [is_textured(s.bsdf()) and is_diffuse(s.bsdf()) for s in model.scene.shapes()]
+    textured = [is_textured(p.shape.bsdf()) and is_diffuse(p.shape.bsdf()) for p in faces.parts]
     for number in np.flatnonzero(textured):
         chosen = np.flatnonzero(faces.shape[face] == number)
         of = np.repeat(face[chosen], 3)

@@ -2,20 +2,20 @@
 
 import os
 
-import mitsuba as mi
 import numpy as np
 
 from ..core.errors import RadiosityError
 from ..core.files import writing
+from ..scene import Model
 from .cameras import cameras, up
-from .geometry import LitMesh
+from .geometry import LitMesh, name_of
 from .textures import png, textures
 
 FLOAT, SHORT, INT = 5126, 5123, 5125  # component types
 VERTICES, INDICES = 34962, 34963  # buffer view targets
 
 
-def write_glb(mesh: LitMesh, path: str | os.PathLike[str], scene: "mi.Scene", exposure: float = 1.0) -> None:
+def write_glb(mesh: LitMesh, path: str | os.PathLike[str], model: Model, exposure: float = 1.0) -> None:
     """Write the mesh, a node per shape, turned so that +y is up, and the scene's cameras.
 
     COLOR_0: radiance times ``exposure``, clipped to [0, 1], linear; where a shape is textured, what its texture, the
@@ -23,18 +23,18 @@ def write_glb(mesh: LitMesh, path: str | os.PathLike[str], scene: "mi.Scene", ex
     """
     file = _File()
     root = file.gltf.nodes
-    root.append(file.lib.Node(name="mi_radiosity", rotation=_upright(up(scene)), children=[]))
+    root.append(file.lib.Node(name="mi_radiosity", rotation=_upright(up(model.scene)), children=[]))
     file.gltf.extras = {"exposure": exposure, "units": "COLOR_0 = exposure * radiance, _RADIOSITY in W/m^2"}
-    pictures = textures(mesh, scene)
+    pictures = textures(mesh, model.faces.parts)
     for shape in np.unique(mesh.shape).tolist():
-        name, primitives = scene.shapes()[shape].id() or f"shape-{shape}", []
+        name, primitives = name_of(model.faces.parts, shape), []
         for back in (False, True):
             chosen = (mesh.shape == shape) & (mesh.back == back)
             if chosen.any():
                 primitives.append(file.primitive(mesh, chosen, pictures.get((shape, back)), exposure))
         file.gltf.meshes.append(file.lib.Mesh(name=name, primitives=primitives))
         file.add_node(name=name, mesh=len(file.gltf.meshes) - 1)
-    for camera in cameras(scene):
+    for camera in cameras(model.scene):
         width, height = camera.size
         view = file.lib.Perspective(
             aspectRatio=width / height, yfov=float(np.radians(camera.y_fov)), znear=camera.near, zfar=camera.far
@@ -72,7 +72,7 @@ class _File:
         kept, number = np.unique(mesh.triangles[chosen], return_inverse=True)
         radiosity, material, texcoord = mesh.radiosity[kept], 0, {}
         color = radiosity
-        if picture is not None:
+        if picture is not None and not mesh.emission[kept].any():  # the light of a lamp has no texture
             white = max(float(picture.image.max()), 1e-6)
             color, material = mesh.irradiance[kept] * white, self._textured(picture.image / white)
             texcoord = {"TEXCOORD_0": self._accessor(picture.place(mesh.uv[kept]).astype("<f4"), FLOAT, "VEC2")}

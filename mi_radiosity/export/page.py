@@ -17,7 +17,7 @@ from ..core.files import check_writable, writing
 from ..solver import Solution
 from ..solver.solution import LUMENS_PER_WATT, LUMINANCE
 from .cameras import cameras, up
-from .geometry import RAISE, LitMesh, lit_mesh
+from .geometry import RAISE, LitMesh, lit_mesh, name_of
 from .textures import png, textures
 from .tone import checked, exposure_of
 
@@ -82,11 +82,11 @@ def page(solution: Solution, exposure: float | str = 1.0, progress: Report | Non
 
 def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
     """What view.js reads: arrays of vertices, triangles and leaves, and what there is once."""
-    scene, flat = solution.model.scene, solution.leaves()
+    scene, parts, flat = solution.model.scene, solution.model.faces.parts, solution.leaves()
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     size = mesh.size
-    pictures = textures(mesh, scene)
-    order, parts = _parts(mesh, scene, list(pictures))
+    pictures = textures(mesh, parts)
+    order, runs = _runs(mesh, parts, list(pictures))
     light, leaf_light = (mesh.direct, mesh.indirect), _flat(solution)
     unit = max(float(max(x.max() for x in (*light, mesh.emission))), 1e-30) / 2**15  # so that halves suffice
     arrays = {
@@ -109,7 +109,7 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
         "luminous": [LUMENS_PER_WATT * w for w in LUMINANCE],
         "most": _round_up(float(np.percentile(lux, 98))),
         "layers": [{"name": name, "kind": name, "scale": 1} for name in LAYERS],
-        "parts": parts,
+        "parts": runs,
         "textures": [base64.b64encode(png(picture.image)).decode() for picture in pictures.values()],
         "views": _views(scene, low, high),
         "up": up(scene).tolist(),
@@ -120,18 +120,19 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
     }
 
 
-def _parts(mesh, scene, textured):
+def _runs(mesh, parts, textured):
     """The order in which triangles are drawn, and runs of them with one name and texture."""
     _, first, number = np.unique(2 * mesh.shape + mesh.back, return_index=True, return_inverse=True)
     order, counts = np.argsort(number, kind="stable"), np.bincount(number)
-    parts, start = [], 0
+    runs, start = [], 0
     for at, count in zip(first.tolist(), counts.tolist()):
         shape, back = int(mesh.shape[at]), bool(mesh.back[at])
         texture = textured.index((shape, back)) if (shape, back) in textured else None
-        name = scene.shapes()[shape].id() or f"shape {shape}"
-        parts.append({"name": name, "back": back, "texture": texture, "start": 3 * start, "count": 3 * count})
+        runs.append(
+            {"name": name_of(parts, shape), "back": back, "texture": texture, "start": 3 * start, "count": 3 * count}
+        )
         start += count
-    return order, parts
+    return order, runs
 
 
 def _flat(solution):

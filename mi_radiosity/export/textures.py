@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..scene.tessellate import Part
 from .geometry import LitMesh
 from .tone import srgb8
 
@@ -33,7 +34,7 @@ def png(linear: np.ndarray) -> bytes:
     return bytes(stream.raw_buffer())
 
 
-def textures(mesh: LitMesh, scene: "mi.Scene") -> dict[tuple[int, bool], Texture]:
+def textures(mesh: LitMesh, parts: list[Part]) -> dict[tuple[int, bool], Texture]:
     """The textures of a mesh by shape and side."""
     found, textured = {}, ~np.isnan(mesh.uv[mesh.triangles[:, 0], 0])
     for shape, back in sorted(set(zip(mesh.shape[textured].tolist(), mesh.back[textured].tolist()))):
@@ -41,7 +42,7 @@ def textures(mesh: LitMesh, scene: "mi.Scene") -> dict[tuple[int, bool], Texture
         uv = mesh.uv[np.unique(mesh.triangles[part])]
         low, high = uv.min(axis=0), uv.max(axis=0)
         if (high > low).all():
-            found[shape, back] = _bake(scene.shapes()[shape].bsdf(), back, low, high)
+            found[shape, back] = _bake(parts[shape].shape.bsdf(), back, low, high)
     return found
 
 

@@ -5,9 +5,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import owned
-from ..display import Field
 from ..mesh.exposure import is_covered
 from ..solver import Solution
+from ..solver.field import Field
 from .cutting import Sides, cut, keys
 
 ORDER = 4  # samples of a piece along a side

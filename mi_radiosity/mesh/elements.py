@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
@@ -22,21 +23,30 @@ class Elements:
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
     way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale``, ``area`` (Float, m²) and
-    ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
+    ``reflectance`` (Color3f, the mean over the element). ``exitance`` (Color3f, the same of E) is there only in scenes
+    with textured lamps, None in others. `Tree` grows; what its `freeze` returns never changes.
     """
 
-    def __init__(self, patches, arrays):
-        self.patches = patches
-        for name in ARRAYS:
-            setattr(self, name, arrays[name])
+    patches: Patches
+    patch: "mi.UInt32"
+    parent: "mi.UInt32"
+    child: "mi.UInt32"
+    place: "mi.UInt32"
+    u0: "mi.Float"
+    v0: "mi.Float"
+    scale: "mi.Float"
+    area: "mi.Float"
+    reflectance: "mi.Color3f"
+    exitance: "mi.Color3f | None"
+
+    def __init__(self, patches, arrays, exitance=None):
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
 
     def __len__(self):
         return dr.width(self.patch)
 
     def __setattr__(self, name, value):
-        if "_frozen" in vars(self):
-            raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
-        super().__setattr__(name, value)
+        raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
 
     @cached_property
     def leaves(self):
@@ -54,7 +64,9 @@ class Elements:
         return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
     def emission(self, element):
-        """E (Color3f [n])."""
+        """E, the mean over elements (Color3f [n])."""
+        if self.exitance is not None:
+            return dr.gather(mi.Color3f, self.exitance, element)
         return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
     def patch_point(self, element, a, b):
@@ -86,13 +98,17 @@ class Elements:
 class Tree(Elements):
     """Elements that still split. ``leaf_count`` is the number of leaves."""
 
-    def __init__(self, patches, materials):
+    __setattr__ = object.__setattr__
+
+    def __init__(self, patches, materials, lights):
         n = patches.count
         every = dr.arange(mi.UInt32, n)
         zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
         arrays = (every, every, zero, zero, nought, nought, dr.full(mi.Float, 1, n), patches.area, patches.reflectance)
         super().__init__(patches, {name: type(array)(array) for name, array in zip(ARRAYS, arrays)})
-        self._materials, self.leaf_count = materials, n
+        self._materials, self._lights, self.leaf_count = materials, lights, n
+        if lights.textured:
+            self.exitance = mi.Color3f(patches.emission)
 
     @property
     def leaves(self):
@@ -100,9 +116,8 @@ class Tree(Elements):
 
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
-        elements = Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
-        elements._frozen = True
-        return elements
+        arrays = {name: type(value)(value) for name, value in self._arrays().items()}
+        return Elements(self.patches, arrays, None if self.exitance is None else mi.Color3f(self.exitance))
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
@@ -118,6 +133,9 @@ class Tree(Elements):
         new = self._children(dr.gather(mi.UInt32, chosen, k // 4), k % 4)
         for name in ARRAYS:
             setattr(self, name, concat(getattr(self, name), new[name]))
+        if self._lights.textured:
+            frame = (new[name] for name in ("patch", "u0", "v0", "scale"))
+            self.exitance = concat(self.exitance, mean_exitance(self.patches, self._lights, *frame))
         self.leaf_count += 3 * count
         dr.eval(*self._arrays().values())
 
@@ -147,4 +165,18 @@ class Tree(Elements):
         for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
             total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
         # Where other lobes are traced, ρ is one number per patch.
-        return dr.select(self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4)
+        return dr.select(
+            self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
+        )
+
+
+def mean_exitance(patches, lights, patch, u0, v0, scale):
+    """E averaged over triangles (u0 + scale a, v0 + scale b) of patches (Color3f [n])."""
+    exitance = dr.zeros(mi.Color3f, dr.width(patch))
+    shining = dr.compress(dr.max(dr.gather(mi.Color3f, patches.emission, patch)) > 0)
+    if dr.width(shining):
+        patch, u0, v0, scale = (dr.gather(type(x), x, shining) for x in (patch, u0, v0, scale))
+        mean = lights.mean_exitance(dr.gather(mi.UInt32, patches.face, patch), u0, v0, scale)
+        dr.scatter(exitance, mean, shining)
+    dr.eval(exitance)
+    return exitance

@@ -20,7 +20,7 @@ class Model:
 
     sides: patches to make (see `Patches`); by default those that light can reach. ``warnings``: what a user should
     know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
-    orientation, reflectance and emission. ``state``: what the scene was like when it was read.
+    orientation, reflectance, emission and lamps. ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
@@ -87,4 +87,6 @@ class Model:
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
+        for light in self.lights.free:
+            digest.update(light.fingerprint())
         return digest.hexdigest()

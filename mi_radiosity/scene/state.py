@@ -28,18 +28,19 @@ class State:
 
 def refuse_gradients(scene) -> None:
     """Raise RadiosityError if a parameter of the scene asks for gradients: a solution has none."""
-    for (_, name), value in _parameters(scene).items():
-        if dr.is_array_v(value) and dr.grad_enabled(value):
-            raise RadiosityError(
-                f"'{name}' asks for gradients, which a radiosity solution does not have yet: use 'prb'"
-            )
+    with dr.resume_grad():  # mi.render suspends them around an integrator
+        for (_, name), value in _parameters(scene).items():
+            if dr.is_array_v(value) and dr.grad_enabled(value):
+                raise RadiosityError(
+                    f"'{name}' asks for gradients, which a radiosity solution does not have yet: use 'prb'"
+                )
 
 
 def _parameters(scene):
     """{(number, name): value} of everything that decides what is solved."""
     things = [*scene.shapes(), *scene.emitters()]
     return {
-        (number, f"{thing.id() or number}.{name}"): value
+        (number, f"{thing.id() or number}.{name}"): type(value)(value)  # Mitsuba's own would change with the scene
         for number, thing in enumerate(things)
         for name, value in mi.traverse(thing)
     }
