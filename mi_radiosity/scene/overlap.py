@@ -49,13 +49,14 @@ class Overlaps:
 
 
 class Lookup:
-    """Overlaps as tables on the device."""
+    """Overlaps as tables on the device; ``under`` and ``over`` as there."""
 
     def __init__(self, overlaps, centre):
         corner = overlaps.corners - centre
         edges = [corner[:, k] - corner[:, 0] for k in (1, 2)]
         self._triangles = [owned_vectors(mi.Point3f, corner[:, 0]), *(owned_vectors(mi.Vector3f, e) for e in edges)]
         self._starts = owned(mi.UInt32, np.searchsorted(overlaps.under, np.arange(overlaps.covered.size + 1)))
+        self.under, self.over = overlaps.under, overlaps.over
         self._over = owned(mi.UInt32, overlaps.over)
 
     @dr.syntax
