@@ -387,12 +387,12 @@ def test_coincident_faces_do_not_speckle(other):
     assert any("lie in others" in w for w in model.warnings)
 
 
-@pytest.mark.parametrize(
-    "rho, says", [(1.0, "bright.*1 or more"), ([0.5, 1, 0.5], "bright"), (float("nan"), "bright.*not a number")]
-)
+@pytest.mark.parametrize("rho, says", [(1.5, "bright.*more than 1"), (float("nan"), "bright.*not a number")])
 def test_impossible_reflectances_are_refused_by_name(rho, says):
     with pytest.raises(mr.RadiosityError, match=says):
-        mr.solve(scene(lamp=ceiling(), bright=quad(SQUARE, bsdf=diffuse(rho), name="bright")))
+        texture = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 3), rho, np.float32))}
+        bsdf = {"type": "diffuse", "reflectance": texture}
+        mr.solve(scene(lamp=ceiling(), bright=quad(SQUARE, bsdf=bsdf, name="bright")))
 
 
 def test_a_wall_keeps_two_lit_rooms_apart():

@@ -15,6 +15,7 @@ from .tessellate import UNMESHED, children, parts
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
+WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
 AT_ONCE = 1 << 22  # samples in one launch
@@ -43,9 +44,14 @@ class Materials:
         self._find_albedos(textured)
         faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
-            (self.rho >= 1).any(axis=(0, 2)),
-            "has a reflectance of 1 or more, which conserves no energy: make it less than 1",
+            (self.rho > 1 + ROUNDING).any(axis=(0, 2)),
+            "has a reflectance of more than 1, which makes energy from nothing: make it less than 1",
         )
+        white = self.rho > WHITEST
+        if white.any():
+            where = faces.names(white.any(axis=(0, 2)))
+            faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
+            self.rho = np.minimum(self.rho, WHITEST)
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
     def _mean(self, faces, points):
