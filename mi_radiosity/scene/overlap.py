@@ -116,7 +116,6 @@ def _precedence(faces, present, exitance, reflectance):
 def coplanar_pairs(corners, normal, area, sound, tolerance):
     """Ordered pairs (f, g) of ``sound`` faces in one plane whose interiors meet (two int [pairs])."""
     low, high = corners.min(axis=1), corners.max(axis=1)
-    offset = (corners[:, 0] * normal).sum(axis=1)
     found = [np.zeros((0, 2), dtype=np.int64)]
 
     def larger_first(f, g):
@@ -124,9 +123,18 @@ def coplanar_pairs(corners, normal, area, sound, tolerance):
         larger = area[f] >= area[g]
         return np.where(larger, f, g), np.where(larger, g, f)
 
+    centre = (low.min(axis=0) + high.max(axis=0)) / 2
+    first, normals = owned_vectors(mi.Point3f, corners[:, 0] - centre), owned_vectors(mi.Vector3f, normal)
+    areas = owned(mi.Float, area)
+
     def near_plane(f, g):
-        f, g = larger_first(f, g)
-        return np.abs(np.einsum("ij,ij->i", corners[g, 0], normal[f]) - offset[f]) <= 2 * tolerance
+        """Is a corner of the smaller face near the plane of the larger one? Most pairs end here, so on the device."""
+        f, g = mi.UInt32(f.astype(np.uint32)), mi.UInt32(g.astype(np.uint32))
+        larger = dr.gather(mi.Float, areas, f) >= dr.gather(mi.Float, areas, g)
+        f, g = dr.select(larger, f, g), dr.select(larger, g, f)
+        d = dr.gather(mi.Point3f, first, g) - dr.gather(mi.Point3f, first, f)
+        near = dr.abs(dr.dot(d, dr.gather(mi.Vector3f, normals, f))) <= dr.opaque(mi.Float, 4 * tolerance)
+        return np.array(near).astype(bool)
 
     for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, near_plane):
         f, g = larger_first(f, g)
