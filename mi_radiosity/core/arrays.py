@@ -16,7 +16,7 @@ def owned(kind, array):
 
     Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
     """
-    kept = np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32)
+    kept = np.array(array, dtype=np.float32 if kind is mi.Float else np.uint32, order="C")  # the copy is made later
     copy = dr.empty(kind, len(kept))
     if len(kept):
         dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))

@@ -100,8 +100,6 @@ class Field:
     def _light_in_sight(self, leaf, slot, x, active):
         """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
         e, landings = self._elements, self._solution.landings
-        if not landings.slots:
-            return mi.Bool(False)
         patch = dr.gather(mi.UInt32, e.patch, leaf, active)
 
         def look(found, k):

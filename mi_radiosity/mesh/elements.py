@@ -155,4 +155,6 @@ class Tree(Elements):
         for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
             total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
         # Where other lobes are traced, ρ is one number per patch.
-        return dr.select(self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4)
+        return dr.select(
+            self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
+        )

@@ -22,7 +22,6 @@ class Hit:
     traced: "mi.Bool"  # [rays] the surface has lobes that are not diffuse
 
 
-
 class Rays:
     """Visibility in a scene, in the words of its patches."""
 
