@@ -7,6 +7,7 @@ from ..core.arrays import NONE, ColorSums, totals
 from ..mesh.exposure import node_point
 from ..mesh.subdivision import HALF_SIDES, child_at, child_corner, child_point
 from ..mesh.vertices import Vertices
+from ..solver import Solution
 from ..transport.landings import SEATS
 
 FAINT = 1e-4  # weight below which a node has no say
@@ -26,7 +27,7 @@ class Field:
     nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
         self.flat = solution.direct + solution.indirect
@@ -55,13 +56,13 @@ class Field:
         dr.eval(self.nodes, self._points, self._walled)
 
     @property
-    def walled(self):
+    def walled(self) -> "mi.Bool":
         """Which leaves does a wall stand on (Bool [elements])?"""
         return self._walled
 
     # ---- Looking up ----------------------------------------------------------------------------
 
-    def at(self, leaf, u, v, active=True):
+    def at(self, leaf: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """H at patch points (u, v) on leaves (Color3f [n])."""
         e = self._elements
         a, b = e.own_point(leaf, u, v, active)

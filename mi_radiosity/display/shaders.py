@@ -35,7 +35,7 @@ class Shader:
 
     name = ""
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             SHADERS.add(cls.name, cls)
@@ -57,11 +57,11 @@ class Gouraud(Shader):
 
     name = "gouraud"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self.field = Field(solution)
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return self.field.at(look.leaf, look.hit.u, look.hit.v, look.lit)
 
 
@@ -70,11 +70,11 @@ class Flat(Shader):
 
     name = "flat"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._irradiance = solution.irradiance()
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return dr.gather(mi.Color3f, self._irradiance, look.leaf, look.lit)
 
 
@@ -83,7 +83,7 @@ class Mesh(Gouraud):
 
     name = "mesh"
 
-    def radiance(self, look):
+    def radiance(self, look: Look) -> "mi.Color3f":
         return super().radiance(look) * dr.select(self._on_outline(look), LINE_SHADE, 1)
 
     def _on_outline(self, look):

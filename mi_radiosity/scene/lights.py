@@ -1,11 +1,14 @@
 """Lamps: one class per kind, and all lamps of a scene behind one face."""
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.errors import RadiosityError
 from ..core.plugins import Registry
+from .faces import Faces
 
 LIGHTS = Registry("emitter")
 
@@ -21,29 +24,31 @@ class Light:
     emitters: tuple[str, ...] = ()
     on_surface = False
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         for name in vars(cls).get("emitters", ()):
             LIGHTS.add(name, cls)
 
-    def __init__(self, emitter, centre, radius):
+    def __init__(self, emitter: "mi.Emitter", centre: np.ndarray, radius: float) -> None:
         self.emitter, self.centre, self.radius = emitter, centre, radius
 
     @staticmethod
-    def exitance(shapes):
+    def exitance(shapes: "Sequence[mi.Shape]") -> np.ndarray:
         """E = π L_e of shapes with such a lamp, W/m² (NumPy [shapes, 3])."""
         raise NotImplementedError
 
-    def power(self):
+    def power(self) -> Sequence[float]:
         """What `shoot` sends into the scene, W (three floats)."""
         raise NotImplementedError
 
-    def shoot(self, x, y, s, t):
+    def shoot(
+        self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
+    ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
         """Rays from four uniform numbers each (Float [n]): origin, unit direction, and the power each would
         carry were it the only one, whose mean is `power` (Point3f, Vector3f, Color3f [n])."""
         raise NotImplementedError
 
-    def sample(self, point, s, t):
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
         """Towards the lamp from points, with two uniform numbers each: unit direction, distance, and the irradiance
         of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
@@ -64,7 +69,7 @@ class Area(Light):
     on_surface = True
 
     @staticmethod
-    def exitance(shapes):
+    def exitance(shapes: "Sequence[mi.Shape]") -> np.ndarray:
         si = dr.zeros(mi.SurfaceInteraction3f, len(shapes))
         si.wi = mi.Vector3f(0, 0, 1)
         pointers = mi.ShapePtr(list(shapes))
@@ -77,7 +82,7 @@ class Lights:
     Raises RadiosityError if there is no light, or if a lamp's is impossible, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self.exitance = self._of_faces(faces)
         box = faces.corners.min(axis=(0, 1)), faces.corners.max(axis=(0, 1))
         centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0]) / 2)
@@ -87,9 +92,9 @@ class Lights:
             raise RadiosityError("the scene has no light: give at least one shape an 'area' emitter")
 
     @staticmethod
-    def _of_faces(faces):
+    def _of_faces(faces: Faces) -> np.ndarray:
         shapes = faces.scene.shapes()
-        by_kind: dict[type, list[int]] = {}
+        by_kind: dict[type[Light], list[int]] = {}
         for number, shape in enumerate(shapes):
             if shape.is_emitter():
                 by_kind.setdefault(LIGHTS.find(shape.emitter().class_name()), []).append(number)

@@ -1,6 +1,7 @@
 """Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -47,7 +48,16 @@ class Lobes:
     def __init__(self, traced: np.ndarray) -> None:
         self._traced = owned(mi.UInt32, traced)
 
-    def follow(self, rays, ray, number, seed, mode, camera, active=True):
+    def follow(
+        self,
+        rays: Any,
+        ray: "mi.Ray3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        mode: "mi.TransportMode",
+        camera: bool,
+        active: "mi.Bool | bool" = True,
+    ) -> Trail:
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
 
         mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.

@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.errors import RadiosityError
 from ..core.arrays import opaque_index, owned
+from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
+from .faces import Faces
 from .lights import LIGHTS
 from .tessellate import can_mesh, label
 
@@ -27,7 +28,7 @@ class Materials:
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self._faces = faces
         shapes = faces.scene.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
@@ -60,7 +61,7 @@ class Materials:
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
 
-    def is_traced(self, face):
+    def is_traced(self, face: "mi.UInt32") -> "mi.Bool":
         """Do faces have lobes that are traced (Bool [n])?"""
         if not self.traced.any():
             return mi.Bool(False)
@@ -83,7 +84,7 @@ class Materials:
                         side[part] = rho
 
     def _albedo(self, faces, samples):
-        """E[w; diffuse] of the BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+        """E[w; diffuse] of BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
@@ -99,7 +100,7 @@ class Materials:
             rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
         return np.array(rho)
 
-    def reflectance_at(self, face, u, v, back):
+    def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
         si = self._faces.surface(face, u, v)
         si.wi = mi.Vector3f(0, 0, dr.select(back, -1.0, 1.0))
@@ -132,7 +133,7 @@ def _nested(obj):
     return callback.found
 
 
-def is_diffuse(bsdf) -> bool:
+def is_diffuse(bsdf: "mi.BSDF") -> bool:
     """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
     if kind in NESTING:
@@ -140,7 +141,7 @@ def is_diffuse(bsdf) -> bool:
     return kind in DIFFUSE
 
 
-def is_textured(bsdf) -> bool:
+def is_textured(bsdf: "mi.BSDF") -> bool:
     """Does the reflectance of ``bsdf`` vary over a surface?"""
     return any(
         is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in _nested(bsdf)
@@ -157,7 +158,7 @@ def _inspect_shape(shape, name):
         yield Finding(name, "its radiance is textured: use a constant radiance")
 
 
-def inspect(scene) -> list[Finding]:
+def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
     for index, shape in enumerate(scene.shapes()):
@@ -169,7 +170,7 @@ def inspect(scene) -> list[Finding]:
     return findings
 
 
-def require_supported(scene) -> None:
+def require_supported(scene: "mi.Scene") -> None:
     """Raise RadiosityError, naming the first part of ``scene`` that is not modelled."""
     findings = inspect(scene)
     if findings:

@@ -6,12 +6,14 @@ import numpy as np
 
 from ..core.arrays import NONE, components, owned
 from ..core.points import ROUNDS, Stream, hash_pair, kronecker, stream_seed, triangle
+from .lights import Lights
+from .rays import Rays
 
 PROBES = 32  # rays per side that look for light
 LAMP_PROBES = 1 << 16  # rays from all lamps together
 
 
-def reached(rays, lights):
+def reached(rays: Rays, lights: Lights) -> np.ndarray:
     """Which patches can light reach (bool [patches])?
 
     Every patch casts PROBES rays and the lamps LAMP_PROBES; light spreads along them, in both

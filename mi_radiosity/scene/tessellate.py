@@ -5,6 +5,7 @@ from collections.abc import Callable
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.plugins import Registry
 
@@ -22,22 +23,22 @@ def mesher(shape_class: str) -> Callable:
     return register
 
 
-def can_mesh(shape) -> bool:
+def can_mesh(shape: "mi.Shape") -> bool:
     return isinstance(shape, mi.Mesh) or shape.class_name() in MESHERS
 
 
-def as_mesh(shape):
+def as_mesh(shape: "mi.Shape") -> "mi.Mesh":
     """``shape`` itself if it is a mesh, or the mesh its mesher makes."""
     return shape if isinstance(shape, mi.Mesh) else MESHERS.find(shape.class_name())(shape)
 
 
-def label(shape, index) -> str:
+def label(shape: "mi.Shape", index: int) -> str:
     """How a shape is called in messages: its id, or its place in the scene."""
     return f"shape '{shape.id()}'" if shape.id() else f"shape {index}"
 
 
 @mesher("Disk")
-def disk_mesh(disk):
+def disk_mesh(disk: "mi.Shape") -> "mi.Mesh":
     """A fan of triangles with exactly the area of ``disk``, so that a lamp keeps its power."""
     angle = np.arange(SEGMENTS) / SEGMENTS
     # Half-way out: Mitsuba finds these points by tracing, and rays at the very rim may miss.
@@ -55,8 +56,9 @@ def disk_mesh(disk):
     return build_mesh(disk, np.vstack([centre, outer]), faces)
 
 
-def build_mesh(shape, vertices, faces):
+def build_mesh(shape: "mi.Shape", vertices: ArrayLike, faces: ArrayLike) -> "mi.Mesh":
     """An ``mi.Mesh`` without vertex normals from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``."""
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
     properties = mi.Properties()
     properties["mesh_bsdf"] = shape.bsdf()
     mesh = mi.Mesh(shape.id(), len(vertices), len(faces), props=properties)

@@ -1,11 +1,14 @@
 """What a solve leaves behind."""
 
 import json
+import os
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.arrays import NONE, opaque_index, owned, owned_vectors
 from ..core.errors import RadiosityError
@@ -40,7 +43,7 @@ class Leaves:
     irradiance: np.ndarray  # [leaves, 3] W/m²
     radiosity: np.ndarray  # [leaves, 3] W/m²
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.area)
 
 
@@ -62,21 +65,29 @@ class Solution:
     landings: Landings
     stats: dict
 
-    def irradiance(self, points=None, normals=None, *, lux: bool = False, samples: int = 1024, seed: int = 0):
+    def irradiance(
+        self,
+        points: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
+        *,
+        lux: bool = False,
+        samples: int = 1024,
+        seed: int = 0,
+    ) -> "np.ndarray | mi.Color3f":
         """Irradiance H at any points of the scene, gathered there: W/m² per channel (NumPy [n, 3]), or with ``lux``
         illuminance, lx (NumPy [n]): 179 lm/W times the luminance of H by Rec. 709's weights.
 
-        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps, and
-        as many rays into the room, per point. Without points: H of all elements (Color3f [elements]).
+        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps,
+        and as many rays into the room, per point. Without points: H of all elements (Color3f [elements]).
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
             return self.direct + self.indirect
-        points, normals = _checked_points(points, normals)
-        gathered = self._gather(points, normals, samples, seed) if len(points) else np.zeros((0, 3))
+        where, towards = _checked_points(points, normals)
+        gathered = self._gather(where, towards, samples, seed) if len(where) else np.zeros((0, 3))
         return LUMENS_PER_WATT * gathered @ LUMINANCE if lux else gathered
 
-    def radiosity(self):
+    def radiosity(self) -> "mi.Color3f":
         """B = E + ρ H, W/m² (Color3f [elements])."""
         return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
 
@@ -105,7 +116,9 @@ class Solution:
             radiosity=of(mi.Color3f, self.radiosity()),
         )
 
-    def render(self, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+    def render(
+        self, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+    ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         Raises RadiosityError if the scene has been edited since it was solved.
@@ -143,10 +156,10 @@ class Solution:
 
     # ---- Files ---------------------------------------------------------------------------------
 
-    def save(self, path) -> None:
+    def save(self, path: str | os.PathLike[str]) -> None:
         """Write the solution as NumPy archive (.npz); no file is left half-written."""
         e = self.elements
-        arrays = {name: np.array(getattr(e, name)) for name in TREE}
+        arrays: dict[str, Any] = {name: np.array(getattr(e, name)) for name in TREE}
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
@@ -162,7 +175,7 @@ class Solution:
             )
 
     @staticmethod
-    def load(path, scene: "mi.Scene | Model") -> "Solution":
+    def load(path: str | os.PathLike[str], scene: "mi.Scene | Model") -> "Solution":
         """Read a solution of ``scene``.
 
         Raises RadiosityError if the file is no solution, is damaged, or belongs to another scene.

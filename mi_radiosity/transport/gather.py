@@ -5,6 +5,8 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, Distribution, totals
 from ..core.points import triangle
+from ..mesh import Elements
+from ..scene import Model
 
 
 class Gatherer:
@@ -14,7 +16,7 @@ class Gatherer:
     is one line to the lamps, or one cosine-distributed ray, and its value an unbiased estimate.
     """
 
-    def __init__(self, model, elements, reflected):
+    def __init__(self, model: Model, elements: Elements, reflected: "mi.Color3f") -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
         patches = model.patches
         self._lamps = dr.compress(dr.max(patches.emission) > 0)
@@ -25,7 +27,15 @@ class Gatherer:
         power = mi.Float64(dr.sum(emission) * dr.gather(mi.Float, patches.area, self._lamps))
         self._choice = Distribution(power, totals([power])[0])
 
-    def direct(self, x, normal, lot, s, t, active=True):
+    def direct(
+        self,
+        x: "mi.Point3f",
+        normal: "mi.Vector3f",
+        lot: "mi.Float",
+        s: "mi.Float",
+        t: "mi.Float",
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Color3f":
         """H from the lamps: E F / p along a line to a point of a lamp that ``lot`` draws by power (Color3f [n])."""
         total = mi.Color3f(0)
         if dr.width(self._lamps):
@@ -47,7 +57,14 @@ class Gatherer:
         weight = F * dr.gather(mi.Float, patches.area, lamp) / mi.Float(self._choice.probability(number))
         return dr.gather(mi.Color3f, patches.emission, lamp) * weight
 
-    def indirect(self, origin, direction, number, seed, active=True):
+    def indirect(
+        self,
+        origin: "mi.Point3f",
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Color3f":
         """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n]).
 
         number: UInt32 [n], seed: UInt32, what rays draw lobes by; what they meet behind lobes shines by itself, too.

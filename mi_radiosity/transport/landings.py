@@ -2,6 +2,7 @@
 
 import drjit as dr
 import mitsuba as mi
+from numpy.typing import ArrayLike
 
 from ..core.arrays import owned
 from ..core.points import hash_pair
@@ -15,13 +16,13 @@ class Landings:
     u, v: patch coordinates (Float [slots · SEATS]), NaN where no light came down.
     """
 
-    def __init__(self, slots, u=None, v=None):
+    def __init__(self, slots: int, u: "ArrayLike | None" = None, v: "ArrayLike | None" = None) -> None:
         self.slots = slots
         nowhere = dr.full(mi.Float, dr.nan, SEATS * slots)
         self.u, self.v = (mi.Float(nowhere) if x is None else owned(mi.Float, x) for x in (u, v))
         self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * slots)
 
-    def offer(self, slot, u, v, number, active):
+    def offer(self, slot: "mi.UInt32", u: "mi.Float", v: "mi.Float", number: "mi.UInt32", active: "mi.Bool") -> None:
         """Rays of a ``number`` each (UInt32 [n]) meet the points (u, v) of crossed leaves."""
         if self.slots == 0:
             return
@@ -39,7 +40,7 @@ class Landings:
             dr.scatter(points, dr.gather(mi.Float, x, offer), seat, drawn)
         dr.eval(self.u, self.v)
 
-    def settled(self):
+    def settled(self) -> "Landings":
         """These landings, seats that were left empty shared with those that were not."""
         if self.slots == 0:
             return self
@@ -54,8 +55,10 @@ class Landings:
             step *= 2
         return result
 
-    def points(self, slot, number, active=True):
-        """Patch points of crossed leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light came
-        down (two Float [n])."""
+    def points(
+        self, slot: "mi.UInt32", number: "mi.UInt32", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Float, mi.Float]":
+        """Patch points of crossed leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light
+        came down (two Float [n])."""
         seat = SEATS * slot + number % SEATS
         return tuple(dr.gather(mi.Float, x, seat, active) for x in (self.u, self.v))

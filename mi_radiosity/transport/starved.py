@@ -9,6 +9,7 @@ from ..core.arrays import opaque_index
 from ..core.points import Stream, kronecker, stream_seed, triangle, uniform
 from ..mesh.hierarchy import pull
 from .gather import Gatherer
+from .problem import Flow, Problem
 
 ENOUGH = 16  # rays a patch should expect
 SAMPLES = 32  # lines to lamps, and as many rays into the room, per starved leaf;
@@ -25,7 +26,7 @@ class Starved:
     into the room, where the solution is known, for the rest. ``rays`` is what that costs.
     """
 
-    def __init__(self, problem, budget, seed):
+    def __init__(self, problem: Problem, budget: int, seed: int) -> None:
         self._problem, self._seed = problem, opaque_index(stream_seed(seed, Stream.STARVED))
         elements, patches = problem.elements, problem.model.patches
         patch_area = dr.gather(mi.Float, patches.area, elements.patch)
@@ -37,7 +38,7 @@ class Starved:
         self.rays = 2 * self.samples * dr.width(self.leaves)
 
     @staticmethod
-    def _affordable(count, budget):
+    def _affordable(count: int, budget: int) -> int:
         """Samples per leaf, 0 if even one is too dear."""
         if count == 0:
             return 0
@@ -48,7 +49,7 @@ class Starved:
             samples //= 2
         return samples if 2 * samples * count <= SHARE * budget else 0
 
-    def feed(self, flow):
+    def feed(self, flow: Flow) -> Flow:
         """``flow`` with the irradiance of the starved leaves replaced by what they gather."""
         if self.rays == 0:
             return flow
