@@ -5,9 +5,8 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..core.arrays import NONE, owned
+from ..core.arrays import NONE
 from ..core.points import ROUNDS
 
 ROULETTE = 5  # lobes after which a ray may end by chance
@@ -40,13 +39,7 @@ class Trail:
 
 
 class Lobes:
-    """Follows rays in a scene some of whose shapes have lobes that are not diffuse.
-
-    traced (bool [shapes]): which of them.
-    """
-
-    def __init__(self, traced: np.ndarray) -> None:
-        self._traced = owned(mi.UInt32, traced)
+    """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
 
     def follow(
         self,

@@ -1,5 +1,7 @@
 """Irradiance as a continuous field over each flat or smooth surface (Gouraud)."""
 
+from typing import Any  # a Solution has a Field
+
 import drjit as dr
 import mitsuba as mi
 
@@ -7,8 +9,6 @@ from ..core.arrays import NONE, ColorSums, totals
 from ..mesh.exposure import node_point
 from ..mesh.subdivision import HALF_SIDES, child_at, child_corner, child_point
 from ..mesh.vertices import Vertices
-from ..solver import Solution
-from ..transport.landings import SEATS
 
 FAINT = 1e-4  # weight below which a node has no say
 SHARPEN = 1  # rounds in which vertices make up for what averaging took from the elements
@@ -27,7 +27,7 @@ class Field:
     nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution: Solution) -> None:
+    def __init__(self, solution: Any) -> None:
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
         self.flat = solution.direct + solution.indirect
@@ -90,27 +90,10 @@ class Field:
             return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
         own = dr.gather(mi.Color3f, self.flat, leaf, active)
-        landed = self._has_landings(slot, active)
-        return dr.select(self._light_in_sight(leaf, slot, x, landed), own, dr.select(landed, 0, total))
-
-    def _has_landings(self, slot, active):
-        """Did light come down on crossed leaves of these slots (Bool [n])?"""
-        landings, asked = self._solution.landings, active & (slot != NONE)
-        return asked & ~dr.isnan(landings.points(slot, mi.UInt32(0), asked)[0])
-
-    def _light_in_sight(self, leaf, slot, x, active):
-        """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
-        e, landings = self._elements, self._solution.landings
-        patch = dr.gather(mi.UInt32, e.patch, leaf, active)
-
-        def look(found, k):
-            u, v = landings.points(slot, k, active)
-            return found | (
-                active & ~found & ~self._rays.blocked(x, e.patches.above(patch, u, v), active & ~found)
-            ), k + 1
-
-        found = mi.Bool(active & False)
-        return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]
+        landings = self._solution.landings
+        landed = landings.any_on(slot, active)
+        seen = landings.in_sight(self._elements, self._rays, leaf, slot, x, landed)
+        return dr.select(seen, own, dr.select(landed, 0, total))
 
     # ---- Building ------------------------------------------------------------------------------
 
@@ -119,13 +102,15 @@ class Field:
         dark = dr.zeros(mi.UInt32, dr.width(leaves))
         if self._solution.landings.slots == 0:
             return dark
-        chosen = dr.compress(self._has_landings(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
+        landings = self._solution.landings
+        chosen = dr.compress(landings.any_on(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
         if dr.width(chosen) == 0:
             return dark
         leaf, bits = dr.gather(mi.UInt32, leaves, chosen), mi.UInt32(0)
         slot, every = dr.gather(mi.UInt32, self._exposure.slot, leaf), dr.full(mi.Bool, True, dr.width(leaf))
         for node in range(6):
-            seen = self._light_in_sight(leaf, slot, node_point(self._elements, leaf, node), every)
+            point = node_point(self._elements, leaf, node)
+            seen = landings.in_sight(self._elements, self._rays, leaf, slot, point, every)
             bits |= dr.select(seen, mi.UInt32(0), 1 << node)
         dr.scatter(dark, bits, chosen)
         dr.eval(dark)
