@@ -32,7 +32,7 @@ def contents(elements):
 @pytest.fixture
 def tree(cornell):
     model = Model(cornell)
-    return Tree(model.patches, model.materials)
+    return Tree(model.patches, model.materials, model.lights)
 
 
 def test_a_frozen_mesh_refuses_writes(tree):

@@ -11,6 +11,7 @@ from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import Solution, solve
+from .pixels import picture
 from .shaders import SHADERS, Look
 
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
@@ -39,7 +40,6 @@ def _integrator_class():
                 if name in props:
                     self.options[name] = kind(props.get(name))
             self.progress = None
-            self._pixel = 1.0
             self._forget()
 
         def _forget(self):
@@ -78,9 +78,7 @@ def _integrator_class():
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            # Mitsuba shrinks ray differentials to the spacing of samples.
-            self._pixel = (spp or chosen.sampler().sample_count()) ** 0.5
-            return super().render(scene, chosen, seed, spp, develop, evaluate)
+            return picture(scene, chosen, spp or chosen.sampler().sample_count(), int(seed), self.sample, develop)
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)
@@ -102,9 +100,13 @@ def _integrator_class():
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
             reflectance = _reflectance(model, prelim, ray, hit, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
-            emission = dr.gather(mi.Color3f, model.patches.emission, hit.patch, emits)
-            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler, dr.opaque(mi.Float, self._pixel))
+            emission = model.lights.seen(model.patches, hit, emits)
+            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
+            if model.lights.has_sky and not self.hide_emitters:
+                direction = ray.d if rays.lobes is None else hit.direction
+                radiance += model.lights.sky(direction, active & ~hit.valid) * dr.inv_pi
+                valid |= active
             if rays.lobes is not None:
                 radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
                 valid |= active & hit.bounced

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.lights import Lights
 from ..scene.materials import Materials
 from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
@@ -24,7 +25,8 @@ class Elements:
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
     way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale``, ``area`` (Float, m²) and
-    ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
+    ``reflectance`` (Color3f, the mean over the element). ``exitance`` (Color3f, the same of E) is there only in scenes
+    with textured lamps, None in others. `Tree` grows; what its `freeze` returns never changes.
     """
 
     patches: Patches
@@ -37,9 +39,12 @@ class Elements:
     scale: "mi.Float"
     area: "mi.Float"
     reflectance: "mi.Color3f"
+    exitance: "mi.Color3f | None"
 
-    def __init__(self, patches: Patches, arrays: "dict[str, dr.ArrayBase]") -> None:
-        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches)
+    def __init__(
+        self, patches: Patches, arrays: "dict[str, dr.ArrayBase]", exitance: "mi.Color3f | None" = None
+    ) -> None:
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
 
     def __len__(self) -> int:
         return dr.width(self.patch)
@@ -63,7 +68,9 @@ class Elements:
         return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
     def emission(self, element: "mi.UInt32") -> "mi.Color3f":
-        """E (Color3f [n])."""
+        """E, the mean over elements (Color3f [n])."""
+        if self.exitance is not None:
+            return dr.gather(mi.Color3f, self.exitance, element)
         return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
     def patch_point(self, element: "mi.UInt32", a: "mi.Float", b: "mi.Float") -> "tuple[mi.Float, mi.Float]":
@@ -101,13 +108,15 @@ class Tree(Elements):
 
     __setattr__ = object.__setattr__  # type: ignore[assignment]
 
-    def __init__(self, patches: Patches, materials: Materials) -> None:
+    def __init__(self, patches: Patches, materials: Materials, lights: Lights) -> None:
         n = patches.count
         every = dr.arange(mi.UInt32, n)
         zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
         arrays = (every, every, zero, zero, nought, nought, dr.full(mi.Float, 1, n), patches.area, patches.reflectance)
         super().__init__(patches, {name: type(array)(array) for name, array in zip(ARRAYS, arrays)})
-        self._materials, self.leaf_count = materials, n
+        self._materials, self._lights, self.leaf_count = materials, lights, n
+        if lights.textured:
+            self.exitance = mi.Color3f(patches.emission)
 
     @property
     def leaves(self) -> "mi.UInt32":
@@ -115,7 +124,8 @@ class Tree(Elements):
 
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
-        return Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
+        arrays = {name: type(value)(value) for name, value in self._arrays().items()}
+        return Elements(self.patches, arrays, None if self.exitance is None else mi.Color3f(self.exitance))
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
@@ -131,6 +141,9 @@ class Tree(Elements):
         new = self._children(dr.gather(mi.UInt32, chosen, k // 4), k % 4)
         for name in ARRAYS:
             setattr(self, name, concat(getattr(self, name), new[name]))
+        if self._lights.textured:
+            frame = (new[name] for name in ("patch", "u0", "v0", "scale"))
+            self.exitance = concat(self.exitance, mean_exitance(self.patches, self._lights, *frame))
         self.leaf_count += 3 * count
         dr.eval(*self._arrays().values())
 
@@ -163,3 +176,17 @@ class Tree(Elements):
         return dr.select(
             self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
         )
+
+
+def mean_exitance(
+    patches: Patches, lights: Lights, patch: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
+) -> "mi.Color3f":
+    """E averaged over triangles (u0 + scale a, v0 + scale b) of patches (Color3f [n])."""
+    exitance = dr.zeros(mi.Color3f, dr.width(patch))
+    shining = dr.compress(dr.max(dr.gather(mi.Color3f, patches.emission, patch)) > 0)
+    if dr.width(shining):
+        patch, u0, v0, scale = (dr.gather(type(x), x, shining) for x in (patch, u0, v0, scale))
+        mean = lights.mean_exitance(dr.gather(mi.UInt32, patches.face, patch), u0, v0, scale)
+        dr.scatter(exitance, mean, shining)
+    dr.eval(exitance)
+    return exitance

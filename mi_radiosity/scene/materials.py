@@ -11,7 +11,7 @@ from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .faces import Faces
 from .lights import LIGHTS
-from .tessellate import can_mesh, label
+from .tessellate import UNMESHED, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
@@ -30,7 +30,7 @@ class Materials:
 
     def __init__(self, faces: Faces) -> None:
         self._faces = faces
-        shapes = faces.scene.shapes()
+        shapes = faces.tracing.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
         self.two_sided = two_sided[faces.shape]
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
@@ -118,55 +118,57 @@ class Finding:
     why: str  # what is wrong and what to do
 
 
-def _nested(obj):
-    """The Mitsuba objects that ``obj`` is made of, itself excluded."""
-
-    class Collect(mi.TraversalCallback):
-        found = ()
-
-        def put(self, name, value, *_):
-            if hasattr(value, "class_name"):
-                self.found += (value,)
-
-    callback = Collect()
-    obj.traverse(callback)
-    return callback.found
-
-
 def is_diffuse(bsdf: "mi.BSDF") -> bool:
     """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
     if kind in NESTING:
-        return all(is_diffuse(part) for part in _nested(bsdf) if isinstance(part, mi.BSDF))
+        return all(is_diffuse(part) for part in children(bsdf) if isinstance(part, mi.BSDF))
     return kind in DIFFUSE
 
 
 def is_textured(bsdf: "mi.BSDF") -> bool:
     """Does the reflectance of ``bsdf`` vary over a surface?"""
     return any(
-        is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in _nested(bsdf)
+        is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in children(bsdf)
     )
 
 
-def _inspect_shape(shape, name):
-    if not can_mesh(shape):
-        yield Finding(name, "only meshes and disks are modelled: export it as a mesh")
+def _inspect_shape(shape):
+    """What is wrong with a shape."""
+    if shape.class_name() == "Instance":
+        yield "its shape group is not found: give the group an id, in the scene itself, and refer to it"
+    elif shape.class_name() in UNMESHED:
+        yield f"{UNMESHED[shape.class_name()]} are not modelled: export it as a mesh"
+    else:
+        yield "shapes of this kind are not modelled: export it as a mesh"
+
+
+def _inspect_part(part):
+    shape = part.shape
+    if not part.can_mesh:
+        yield from _inspect_shape(shape)
         return
     if shape.interior_medium() is not None or shape.exterior_medium() is not None:
-        yield Finding(name, "participating media are not modelled: remove the medium")
-    if shape.is_emitter() and mi.has_flag(shape.emitter().flags(), mi.EmitterFlags.SpatiallyVarying):
-        yield Finding(name, "its radiance is textured: use a constant radiance")
+        yield "participating media are not modelled: remove the medium"
+    if shape.is_emitter() and shape.emitter().get_medium() is not None:
+        yield "its emitter is in a medium, and those are not modelled: remove the medium"
+
+
+def _inspect_emitter(emitter):
+    if emitter.class_name() not in LIGHTS:
+        yield f"emitters of this kind are not modelled: use one of {', '.join(LIGHTS)}"
+    elif refusal := LIGHTS.find(emitter.class_name()).refusal(emitter):
+        yield refusal
 
 
 def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
-    for index, shape in enumerate(scene.shapes()):
-        findings += _inspect_shape(shape, f"{label(shape, index)} ({shape.class_name()})")
+    for part in parts(scene):
+        findings += [Finding(f"{part.name} ({part.shape.class_name()})", why) for why in _inspect_part(part)]
     for index, emitter in enumerate(scene.emitters()):
-        if emitter.class_name() not in LIGHTS:
-            what = f"emitter '{emitter.id() or index}' ({emitter.class_name()})"
-            findings.append(Finding(what, "only constant area emitters are modelled: use an 'area' emitter"))
+        what = f"emitter '{emitter.id() or index}' ({emitter.class_name()})"
+        findings += [Finding(what, why) for why in _inspect_emitter(emitter)]
     return findings
 
 

@@ -88,6 +88,6 @@ class Model:
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
-        for light in sorted(light.fingerprint() for light in self.lights.free):
-            digest.update(light)
+        for light in self.lights.free:
+            digest.update(light.fingerprint())
         return digest.hexdigest()

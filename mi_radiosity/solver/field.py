@@ -24,13 +24,14 @@ class Field:
     Where a wall stands on a leaf, each side of it is shown by the nodes on that side that light came down in sight
     of; and where there is none, by the leaf's own value if light came down in sight of the point itself.
 
+    irradiance: of the elements (Color3f [elements]), by default all of the solution's.
     nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution: Any) -> None:
+    def __init__(self, solution: Any, irradiance: "mi.Color3f | None" = None) -> None:
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
-        self.flat = solution.direct + solution.indirect
+        self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
         leaves = self._elements.leaves
         H = dr.gather(mi.Color3f, self.flat, leaves)
         self._vertices = Vertices(solution.model, self._elements)

@@ -17,6 +17,7 @@ from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
 from ..mesh import Elements, Exposure
+from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
 from ..scene import Model
 from ..scene.nearest import nearest_face
@@ -40,7 +41,7 @@ class Leaves:
 
     vertices: np.ndarray  # [leaves, 3, 3] m, in the coordinates of the scene
     shape: np.ndarray  # [leaves] number of the shape in scene.shapes()
-    face: np.ndarray  # [leaves] number of the face within its shape
+    face: np.ndarray  # [leaves] number of the face within its shape, or within the member of an instance
     back: np.ndarray  # [leaves] bool: the back of the face
     level: np.ndarray  # [leaves] how often its patch was split
     area: np.ndarray  # [leaves] m²
@@ -95,7 +96,7 @@ class Solution:
         where, towards = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-        gatherer = Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+        gatherer = self.gatherer()
         report = partial(progress, "gather")
         found = probe(gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
         if lux:
@@ -141,6 +142,10 @@ class Solution:
         """H as a continuous field over the surfaces."""
         return Field(self)
 
+    def gatherer(self) -> Gatherer:
+        """What gathers irradiance at any places, by this solution's radiosity."""
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+
     def _reflected(self):
         return self.elements.reflectance * self.irradiance()
 
@@ -156,7 +161,7 @@ class Solution:
 
         return Leaves(
             vertices=np.stack(corners, axis=1) + faces.centre,
-            shape=faces.shape[face],
+            shape=np.array([part.number for part in faces.parts])[faces.shape[face]],
             face=face - np.searchsorted(faces.shape, faces.shape[face]),
             back=np.array(dr.gather(mi.Bool, e.patches.back, patch)).astype(bool),
             level=np.array(e.level(leaf)),
@@ -220,7 +225,11 @@ class Solution:
         reflectance, direct, indirect = (owned_vectors(mi.Color3f, data[name].T) for name in COLORS)
         arrays = {name: owned(mi.Float if data[name].dtype.kind == "f" else mi.UInt32, data[name]) for name in TREE}
         area = dr.gather(mi.Float, model.patches.area, arrays["patch"]) * arrays["scale"] ** 2
-        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance})
+        exitance = None
+        if model.lights.textured:
+            frame = (arrays[name] for name in ("patch", "u0", "v0", "scale"))
+            exitance = mean_exitance(model.patches, model.lights, *frame)
+        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance}, exitance)
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)

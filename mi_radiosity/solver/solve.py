@@ -55,7 +55,7 @@ def solve(
     wanted = _wanted(model, elements, epsilon)
     clock.lap("scene")
 
-    tree = Tree(model.patches, model.materials)
+    tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
         model,

@@ -57,16 +57,12 @@ class Gatherer:
         total = mi.Color3f(0)
         if self._lamps.count:
             lamp, density = self._lamps.draw(lot, places.leaf)
-            F = rays.kernel_at(x, normal, lamp, *triangle(s, t), active)
+            u, v = triangle(s, t)
+            F = rays.kernel_at(x, normal, lamp, u, v, active)
             shared = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
-            total += dr.gather(mi.Color3f, self._model.patches.emission, lamp) * (F / (density + shared))
+            total += self._emission(lamp, u, v, F > 0) * (F / (density + shared))
         for light in self._free:
-            direction, distance, irradiance = light.sample(x + self._model.patches.origin, s, t)
-            cosine = dr.dot(direction, normal)
-            lit = active & (cosine > 0)
-            start = x + normal * self._model.patches.lift
-            hidden = rays.blocked(start, start + direction * distance, lit)
-            total += dr.select(lit & ~hidden, irradiance * cosine, 0)
+            total += light.lights_up(rays, x, normal, s, t, active)
         return total
 
     def rays(
@@ -88,13 +84,21 @@ class Gatherer:
         hit = model.rays.follow(origin, direction, number, seed, active=active)
         met = active & (hit.patch != NONE)
         H = self._looked_up(hit, met)
-        emission = dr.gather(mi.Color3f, patches.emission, hit.patch, met)
+        emission = model.lights.seen(patches, hit, met)
         if model.rays.lobes is None:
             return H, emission * self._share_of_rays(places, hit, met, rays_per_line)
         straight = met & ~hit.bounced
         lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
         seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
-        return dr.select(active, hit.glow + hit.weight * (H + seen), 0), lamp
+        sky = model.lights.sky(hit.direction, active & hit.bounced & ~hit.valid)
+        return dr.select(active, hit.glow + hit.weight * (H + seen + sky), 0), lamp
+
+    def _emission(self, patch, u, v, active):
+        """E at points of lamps (Color3f [n])."""
+        lights, patches = self._model.lights, self._model.patches
+        if not lights.textured:
+            return dr.gather(mi.Color3f, patches.emission, patch)
+        return lights.exitance_at(dr.gather(mi.UInt32, patches.face, patch), u, v, active)
 
     def _looked_up(self, hit, met):
         """ρ H where rays end, 0 behind walls that keep the light of their leaf from them (Color3f [n])."""
