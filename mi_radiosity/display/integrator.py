@@ -78,7 +78,8 @@ def _integrator_class():
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            return picture(scene, chosen, spp or chosen.sampler().sample_count(), int(seed), self.sample, develop)
+            seed = int(seed[0] if dr.is_array_v(seed) else seed)
+            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self.sample, develop)
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)

@@ -43,6 +43,11 @@ class Shader:
     def __init__(self, solution: Solution):
         self.solution = solution
 
+    @classmethod
+    def legend(cls, solution: Solution) -> str:
+        """What there is to know to read its pictures: one line, or nothing."""
+        return ""
+
     def irradiance(self, look: Look) -> "mi.Color3f":
         """H where rays meet patches, W/m² (Color3f [rays])."""
         raise NotImplementedError(f"{type(self).__name__} must define irradiance(look)")

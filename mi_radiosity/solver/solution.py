@@ -190,8 +190,11 @@ class Solution:
 
     # ---- Files ---------------------------------------------------------------------------------
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the solution as NumPy archive (.npz); no file is left half-written."""
+    def save(self, path: str | os.PathLike[str], source: dict | None = None) -> None:
+        """Write the solution as NumPy archive (.npz); no file is left half-written.
+
+        source: where the scene came from, for `source_of` to tell.
+        """
         e = self.elements
         arrays: dict[str, Any] = {name: np.array(getattr(e, name)) for name in TREE}
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
@@ -205,8 +208,18 @@ class Solution:
                 fingerprint=self.model.fingerprint,
                 sides=self.model.patches.sides,
                 stats=json.dumps(self.stats),
+                source=json.dumps(source),
                 **arrays,
             )
+
+    @staticmethod
+    def source_of(path: str | os.PathLike[str]) -> dict | None:
+        """Where the scene of a kept solution came from, as `save` was told; None if it was not.
+
+        Raises RadiosityError if the file is no solution, or is damaged.
+        """
+        data, _ = _read(path)
+        return json.loads(str(data["source"])) if "source" in data else None
 
     @staticmethod
     def load(path: str | os.PathLike[str], scene: "mi.Scene | Model") -> "Solution":
