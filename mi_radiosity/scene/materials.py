@@ -9,6 +9,7 @@ import numpy as np
 from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
+from .faces import Faces
 from .lights import LIGHTS
 from .tessellate import UNMESHED, children, parts
 
@@ -28,7 +29,7 @@ class Materials:
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self._faces = faces
         shapes = faces.tracing.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
@@ -66,7 +67,7 @@ class Materials:
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
 
-    def is_traced(self, face, active=True):
+    def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Do faces have lobes that are traced (Bool [n])?"""
         if not self.traced.any():
             return mi.Bool(False)
@@ -89,7 +90,7 @@ class Materials:
                         side[part] = rho
 
     def _albedo(self, faces, samples):
-        """E[w; diffuse] of the BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+        """E[w; diffuse] of BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
@@ -105,7 +106,7 @@ class Materials:
             rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
         return np.array(rho)
 
-    def reflectance_at(self, face, u, v, back):
+    def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
         si = self._faces.surface(face, u, v)
         si.wi = mi.Vector3f(0, 0, dr.select(back, -1.0, 1.0))
@@ -123,7 +124,7 @@ class Finding:
     why: str  # what is wrong and what to do
 
 
-def is_diffuse(bsdf) -> bool:
+def is_diffuse(bsdf: "mi.BSDF") -> bool:
     """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
     if kind in NESTING:
@@ -131,7 +132,7 @@ def is_diffuse(bsdf) -> bool:
     return kind in DIFFUSE
 
 
-def is_textured(bsdf) -> bool:
+def is_textured(bsdf: "mi.BSDF") -> bool:
     """Does the reflectance of ``bsdf`` vary over a surface?"""
     return any(
         is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in children(bsdf)
@@ -166,7 +167,7 @@ def _inspect_emitter(emitter):
         yield refusal
 
 
-def inspect(scene) -> list[Finding]:
+def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
     for part in parts(scene):
@@ -177,7 +178,7 @@ def inspect(scene) -> list[Finding]:
     return findings
 
 
-def require_supported(scene) -> None:
+def require_supported(scene: "mi.Scene") -> None:
     """Raise RadiosityError, naming the first part of ``scene`` that is not modelled."""
     findings = inspect(scene)
     if findings:

@@ -6,13 +6,15 @@ import numpy as np
 
 from ..core.arrays import NONE, components, owned
 from ..core.points import ROUNDS, Stream, hash_pair, kronecker, stream_seed, triangle
+from .lights import Lights
+from .rays import Rays
 
 GLANCES, PROBES = 4, 32  # rays per side that look for light: of all, and of those that found none
 MOST_PROBES = 1 << 23  # rays of all sides together, where there are that many
 LAMP_PROBES = 1 << 16  # rays from all lamps together
 
 
-def reached(rays, lights):
+def reached(rays: Rays, lights: Lights) -> np.ndarray:
     """Which patches can light reach (bool [patches])?
 
     Every patch casts GLANCES rays and the lamps LAMP_PROBES; light spreads along them, in both

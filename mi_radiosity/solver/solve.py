@@ -133,7 +133,8 @@ def _wanted(model, elements, epsilon):
         return count + ELEMENTS
     if elements < count:
         raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: ask for at least {count} elements"
+            f"the scene has {count} patches, so {elements} elements cannot be reached: "
+            f"ask for at least {count} elements"
         )
     return elements
 
@@ -141,9 +142,9 @@ def _wanted(model, elements, epsilon):
 class _Clock:
     """Seconds by stage."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._start = self._last = time.perf_counter()
-        self._stages = {}
+        self._stages: dict[str, float] = {}
 
     def lap(self, stage):
         dr.sync_thread()
