@@ -5,12 +5,15 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
+from .export.commands import add_commands as add_export_commands
+from .export.commands import recall_scene
 from .export.commands_measure import add_measure
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
@@ -65,6 +68,7 @@ def _parser() -> Parser:
         add(command)
         command.set_defaults(command=run)
     add_measure(commands, _solution_arguments, progress_bars)
+    add_export_commands(commands, _loading_arguments, progress_bars)
     return parser
 
 
@@ -79,8 +83,9 @@ def _scene_arguments(parser):
 
 def _solution_arguments(parser):
     parser.add_argument("solution", type=Path, metavar="SOLUTION.npz", help="what render --save has kept")
-    parser.add_argument("--scene", type=Path, required=True, metavar="SCENE", help="the Mitsuba XML file it is of")
+    parser.add_argument("--scene", type=Path, metavar="SCENE", help="the scene's file, if it is not where it was")
     _loading_arguments(parser)
+    parser.set_defaults(mode=None)  # as it was kept
 
 
 def _loading_arguments(parser):
@@ -250,7 +255,7 @@ def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[st
 def _keep(arguments: argparse.Namespace, solution: "Solution") -> None:
     """Write what was asked for beside pictures."""
     if arguments.save:
-        solution.save(arguments.save)
+        solution.save(arguments.save, asdict(arguments.file))
     if arguments.stats:
         with writing(arguments.stats) as temporary:
             Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
@@ -400,6 +405,7 @@ def _prepare(arguments: argparse.Namespace) -> None:
     from .evaluation.scenes import scene_file
 
     mi.set_log_level(mi.LogLevel.Error)
+    recall_scene(arguments)
     arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
     if "shading" in arguments:

@@ -16,8 +16,8 @@ from ..transport import PILOT, Gathering, Problem, Shooting, Transport
 from .refine import Refinement
 from .solution import Solution
 
-ELEMENTS = 19_000  # default mesh: so many leaves more than patches, or twice the patches
-RAYS_PER_ELEMENT = 300  # default ray budget
+ELEMENTS = 19_000  # default mesh: so many leaves more than patches
+RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 
 
 @interruptible()
@@ -38,8 +38,9 @@ def solve(
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more than the scene has patches, or twice the patches, unless the oracle finds less
-    to refine. rays: rays that carry the power, used exactly; 300 per element by default. lines: random
+    either, 19,000 more than the scene has patches, unless the oracle finds less
+    to refine. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
+    elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
     default. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
@@ -55,7 +56,7 @@ def solve(
     wanted = _wanted(model, elements, epsilon)
     clock.lap("scene")
 
-    tree = Tree(model.patches, model.materials)
+    tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
         model,
@@ -73,7 +74,7 @@ def solve(
     problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
     clock.lap("refine")
 
-    rays = int(rays or RAYS_PER_ELEMENT * tree.leaf_count)
+    rays = int(rays or RAYS_PER_ELEMENT * min(tree.leaf_count, ELEMENTS) + LEAST_RAYS * tree.leaf_count)
     gathering = Gathering(problem, rays, seed)
     shot = rays - gathering.rays
     flow = transport(
@@ -83,8 +84,8 @@ def solve(
         refinement.first_share,
         lambda done: report("distribute", done, rays),
     )
-    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
     power = _balance(problem, flow)
+    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
     clock.lap("distribute")
 
     stats = {
@@ -129,10 +130,11 @@ def _wanted(model, elements, epsilon):
     if epsilon is not None:
         return None
     if elements is None:
-        return count + max(ELEMENTS, count)
+        return count + ELEMENTS
     if elements < count:
         raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: ask for at least {count} elements"
+            f"the scene has {count} patches, so {elements} elements cannot be reached: "
+            f"ask for at least {count} elements"
         )
     return elements
 
@@ -140,9 +142,9 @@ def _wanted(model, elements, epsilon):
 class _Clock:
     """Seconds by stage."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._start = self._last = time.perf_counter()
-        self._stages = {}
+        self._stages: dict[str, float] = {}
 
     def lap(self, stage):
         dr.sync_thread()
@@ -154,9 +156,9 @@ class _Clock:
 
 
 def _balance(problem, flow):
-    """Emitted, absorbed, escaped and unshot power in W, channels added up.
+    """Emitted, absorbed, escaped and unshot power of a transport in W, channels added up.
 
-    What is absorbed comes from the irradiance of the solution, not from counting rays.
+    What is absorbed comes from its irradiance, not from counting rays.
     """
     leaves, elements = problem.elements.leaves, problem.elements
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)

@@ -7,12 +7,15 @@ import mitsuba as mi
 
 from ..core.arrays import NONE
 from ..core.points import triangle
+from ..mesh import Elements, Exposure
+from ..scene import Model
 from .lamps import LampChoice
+from .landings import Landings
 
 
 @dataclass
 class Places:
-    """Points that look for light, [n]; relative to the patches' origin. ``leaf``: the elements they lie on, if known."""
+    """Points that look for light, [n]; relative to the patches' origin. ``leaf``: elements they lie on, if known."""
 
     x: "mi.Point3f"
     normal: "mi.Vector3f"
@@ -22,19 +25,29 @@ class Places:
 class Gatherer:
     """Irradiance at points of a scene whose radiosity is known.
 
-    reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses a
-    leaf that light is. Each sample is one line to the lamps, or one
-    cosine-distributed ray, and its value an unbiased estimate. Where both are drawn, lamps are found by both; the
-    balance heuristic (Veach 1997) weighs them, so that no estimate exceeds their exitance however near they are.
+    reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses
+    a leaf that light is. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
+    an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
+    so that no estimate exceeds their exitance however near they are.
     """
 
-    def __init__(self, model, elements, exposure, landings, reflected) -> None:
+    def __init__(
+        self, model: Model, elements: Elements, exposure: Exposure, landings: Landings, reflected: "mi.Color3f"
+    ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
         self._exposure, self._landings = exposure, landings
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
 
-    def lines(self, places, lot, s, t, rays_per_line=0.0, active=True):
+    def lines(
+        self,
+        places: Places,
+        lot: "mi.Float",
+        s: "mi.Float",
+        t: "mi.Float",
+        rays_per_line: float = 0.0,
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Color3f":
         """H from the lamps along lines to points of them (Color3f [n]): E F / (p + c F), p the density of the point.
 
         lot, s, t: uniform numbers that draw a lamp and a point of it; rays_per_line: c, how many `rays` there are per
@@ -44,19 +57,23 @@ class Gatherer:
         total = mi.Color3f(0)
         if self._lamps.count:
             lamp, density = self._lamps.draw(lot, places.leaf)
-            F = rays.kernel_at(x, normal, lamp, *triangle(s, t), active)
+            u, v = triangle(s, t)
+            F = rays.kernel_at(x, normal, lamp, u, v, active)
             shared = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
-            total += dr.gather(mi.Color3f, self._model.patches.emission, lamp) * (F / (density + shared))
+            total += self._emission(lamp, u, v, F > 0) * (F / (density + shared))
         for light in self._free:
-            direction, distance, irradiance = light.sample(x + self._model.patches.origin, s, t)
-            cosine = dr.dot(direction, normal)
-            lit = active & (cosine > 0)
-            start = x + normal * self._model.patches.lift
-            hidden = rays.blocked(start, start + direction * distance, lit)
-            total += dr.select(lit & ~hidden, irradiance * cosine, 0)
+            total += light.lights_up(rays, x, normal, s, t, active)
         return total
 
-    def rays(self, places, direction, number, seed, rays_per_line=None, active=True):
+    def rays(
+        self,
+        places: Places,
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        rays_per_line: float | None = None,
+        active: "mi.Bool | bool" = True,
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
         """H from the room, and H from the lamps, that cosine-distributed rays meet (two Color3f [n]).
 
         number: UInt32 [n], seed: UInt32, what rays draw lobes by. rays_per_line: see `lines`; without lines, None.
@@ -67,13 +84,21 @@ class Gatherer:
         hit = model.rays.follow(origin, direction, number, seed, active=active)
         met = active & (hit.patch != NONE)
         H = self._looked_up(hit, met)
-        emission = dr.gather(mi.Color3f, patches.emission, hit.patch, met)
+        emission = model.lights.seen(patches, hit, met)
         if model.rays.lobes is None:
             return H, emission * self._share_of_rays(places, hit, met, rays_per_line)
         straight = met & ~hit.bounced
         lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
         seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
-        return dr.select(active, hit.glow + hit.weight * (H + seen), 0), lamp
+        sky = model.lights.sky(hit.direction, active & hit.bounced & ~hit.valid)
+        return dr.select(active, hit.glow + hit.weight * (H + seen + sky), 0), lamp
+
+    def _emission(self, patch, u, v, active):
+        """E at points of lamps (Color3f [n])."""
+        lights, patches = self._model.lights, self._model.patches
+        if not lights.textured:
+            return dr.gather(mi.Color3f, patches.emission, patch)
+        return lights.exitance_at(dr.gather(mi.UInt32, patches.face, patch), u, v, active)
 
     def _looked_up(self, hit, met):
         """ρ H where rays end, 0 behind walls that keep the light of their leaf from them (Color3f [n])."""
