@@ -10,6 +10,7 @@ from .visible import blocked, first_faces, hidden, on_top
 REACH = 3  # texels, across which a wall is thin
 SAMPLES = 64  # that tell how bright it is on either side of a wall
 CONTRAST = 0.9  # relative difference above which a surface is cut: one side is dark
+LEAST_PAIRS = 8  # of texels, below which a wall is only a leg
 MOST_CUTS = 16  # of a surface
 PARALLEL = 0.98  # cosine between a wall and a surface, above which it does not stand on it
 NEAR = 1e-3  # of a texel, within which planes are one and corners lie on them
@@ -75,7 +76,8 @@ def _planes(model, surface, wall, tolerance):
     offset = ((faces.corners[wall, 0] - faces.centre) * normal).sum(axis=1)
     key = np.column_stack([surface, np.round(normal * 1e4), np.round(offset / tolerance)]).astype(np.int64)
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    order = first[np.argsort(-count, kind="stable")]
+    order = np.argsort(-count, kind="stable")
+    order = first[order[count[order] >= LEAST_PAIRS]]
     rank = np.array([np.count_nonzero(surface[order[:k]] == surface[order[k]]) for k in range(len(order))], dtype=int)
     kept = order[rank < MOST_CUTS]
     return surface[kept], normal[kept], offset[kept], tolerance

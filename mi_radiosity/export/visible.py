@@ -8,8 +8,9 @@ from ..core.arrays import NONE, opaque_index, owned, owned_vectors
 from ..core.points import cosine_direction, kronecker
 from ..scene import Model
 
-LOOKS = 8  # rays per point that look for the inside of a solid
-POCKET = 0.05  # of the scene's diagonal: what is narrower all around a point is no room
+LOOKS = 16  # rays per point that look for the inside of a solid
+POCKET = 0.05  # of the scene's diagonal: what is narrower around a point is no room,
+MOST = 14 / 16  # in so many directions
 
 
 def hidden(
@@ -19,7 +20,7 @@ def hidden(
 
     points, normals (unit): [n, 3]. light: what was found there [n, …]; only points that have none, and that are
     ``asked`` for (bool [n]), are looked at: whether most of what they see are backs that take no part in light
-    transport, or whether all of it is near.
+    transport, or whether nearly all of it is near.
     """
     dark = light.reshape(len(points), -1).max(axis=1, initial=0) == 0
     dark = np.flatnonzero(dark if asked is None else dark & asked)
@@ -27,15 +28,15 @@ def hidden(
         return dark
     x, normal = _above(model, points[dark], normals[dark])
     size = np.linalg.norm(np.ptp(model.faces.corners.reshape(-1, 3), axis=0))
-    near, pocket = dr.opaque(mi.Float, POCKET * float(size)), dr.full(mi.Bool, True, len(dark))
-    every, backs = dr.arange(mi.UInt32, len(dark)), mi.UInt32(0)
+    reach = dr.opaque(mi.Float, POCKET * float(size))
+    every, backs, near = dr.arange(mi.UInt32, len(dark)), mi.UInt32(0), mi.UInt32(0)
     for look in range(LOOKS):
         _, _, s, t = kronecker(opaque_index(look), every, opaque_index(0))
         direction = cosine_direction(normal, s, t)
         hit = model.rays.trace(x + model.patches.origin, direction)
         backs += dr.select(hit.valid & hit.back & (hit.patch == NONE) & ~hit.traced, mi.UInt32(1), 0)
-        pocket &= model.rays.blocked(x, x + direction * near, pocket)
-    return dark[np.array(pocket | (2 * backs > LOOKS)).astype(bool)]
+        near += dr.select(model.rays.blocked(x, x + direction * reach), mi.UInt32(1), 0)
+    return dark[np.array((near >= MOST * LOOKS) | (2 * backs > LOOKS)).astype(bool)]
 
 
 def on_top(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:
