@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import RadiosityError
 from ..core.files import check_writable
+from .commands_lightmap import bake, lightmap_arguments, refuse_without_lightmap
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     from ..solver import Solution
@@ -19,7 +20,11 @@ Bars = Callable[[], AbstractContextManager[Callable[[str, int, int | None], None
 def add_commands(commands: Any, loading_arguments: Callable[[Any], None], bars: Bars) -> None:
     """Add the commands to a parser's; ``loading_arguments`` adds what says how a scene is loaded."""
     for run, files, text in (
-        (_export, "OUT.ply|.glb|.xml", "write a kept solution as a mesh, or as a scene that shines by itself"),
+        (
+            _export,
+            "OUT.ply|.glb|.xml|.exr",
+            "write a kept solution as a mesh, a scene that shines by itself, a lightmap",
+        ),
         (_view, "VIEW.html", "write a page to walk through a kept solution, offline"),
     ):
         parser = commands.add_parser(run.__name__.strip("_"), help=text)
@@ -28,6 +33,8 @@ def add_commands(commands: Any, loading_arguments: Callable[[Any], None], bars: 
         add("-o", "--output", required=True, type=Path, metavar=files)
         add("--scene", type=Path, metavar="SCENE", help="the scene's file, if it is not where it was")
         add("--exposure", default="1", metavar="X|auto", help="what radiance is multiplied by for colours (default 1)")
+        if run is _export:
+            lightmap_arguments(parser)
         loading_arguments(parser)
         parser.set_defaults(command=run, mode=None, bars=bars)
 
@@ -65,6 +72,10 @@ def _export(arguments: argparse.Namespace) -> None:
     from .tone import checked
 
     checked(arguments.exposure)
+    if arguments.lightmap is not None:
+        bake(arguments, _load)
+        return
+    refuse_without_lightmap(arguments)
     check_target(arguments.output)
     solution = _load(arguments)
     with arguments.bars() as report:

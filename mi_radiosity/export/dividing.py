@@ -1,5 +1,7 @@
 """Surfaces of an atlas cut where walls stand on them that are thinner than texels, and dark on one side."""
 
+from typing import Any
+
 import numpy as np
 
 from ..scene.overlap import surfaces
@@ -27,7 +29,8 @@ def cut_at_walls(solution: Solution, atlas: Atlas, where: Spots) -> Pieces | Non
     asked = np.zeros(len(points), dtype=bool)
     asked[first] = asked[second] = True
     light = np.zeros(len(points))
-    light[asked] = solution.irradiance(points[asked], normals[asked], samples=SAMPLES).mean(axis=1)
+    found: Any = solution.irradiance(points[asked], normals[asked], samples=SAMPLES)
+    light[asked] = found.mean(axis=1)
     asked[hidden(model, points, normals, light, asked)] = False
     a, b = light[first], light[second]
     leaks = (np.abs(a - b) > CONTRAST * np.maximum(a, b)) & asked[first] & asked[second]

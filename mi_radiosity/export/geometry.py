@@ -7,6 +7,7 @@ import numpy as np
 
 from ..core.arrays import owned
 from ..mesh.subdivision import NODES
+from ..scene import Model
 from ..scene.materials import is_diffuse, is_textured
 from ..scene.tessellate import Part
 from ..solver import Solution
@@ -78,7 +79,7 @@ def lit_mesh(solution: Solution) -> LitMesh:
 
     Mirrors and glass, as far as they have no diffuse lobe, are left out or black: nothing can be baked of them.
     """
-    mesh, dark = _lit(solution), _dark_faces(solution.model)
+    mesh, dark = _lit(solution), dark_faces(solution.model)
     n, corners = len(dark), solution.model.faces.corners[dark].reshape(-1, 3)
     black = np.zeros((3 * n, 3))
     more = LitMesh(
@@ -102,7 +103,7 @@ def name_of(parts: list[Part], number: int) -> str:
     return parts[number].shape.id() or f"shape-{number}"
 
 
-def _dark_faces(model):
+def dark_faces(model: Model) -> np.ndarray:
     """Numbers of opaque faces neither side of which is a patch or lies under one."""
     faces, known = model.faces, np.zeros(len(model.faces), dtype=bool)
     known[np.array(model.patches.face)] = True
@@ -146,11 +147,11 @@ def _lit(solution):
         leaf=of,
         shape=shape,
         back=back,
-        above=_above(model, face, back),
+        above=sides_below(model, face, back),
     )
 
 
-def _above(model, face, back):
+def sides_below(model: Model, face: np.ndarray, back: np.ndarray) -> np.ndarray:
     """How many patches sides of faces lie on; a back lies on its own front."""
     height, known = np.zeros(2 * len(model.faces), dtype=np.int64), np.zeros(2 * len(model.faces), dtype=bool)
     known[2 * np.array(model.patches.face) + np.array(model.patches.back).astype(np.int64)] = True

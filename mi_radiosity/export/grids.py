@@ -73,7 +73,7 @@ def plane_grid(model: Model, text: str, spacing: float | None = None) -> Grid:
 def shape_grid(model: Model, name: str, spacing: float | None = None) -> Grid:
     """Points over a shape, known by its id: each of its flat surfaces has a grid along its own edges, of one point at
     least. Raises RadiosityError that lists the names if there is no such shape."""
-    names = [shape.id() for shape in model.scene.shapes()]
+    names = [part.shape.id() for part in model.faces.parts]
     if name not in names:
         raise RadiosityError(f"there is no shape '{name}': choose one of {', '.join(filter(None, names))}")
     faces = model.faces

@@ -1,7 +1,7 @@
 """Lightmaps: irradiance gathered at the points where texels of an atlas lie."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,9 @@ from ..core.errors import RadiosityError
 from ..core.extras import optional
 from ..solver import Solution
 from .atlas import SPOTS, Atlas, emission, on_surface, reflectance, spots, unwrap, whole
+from .dividing import cut_at_walls
 from .seams import level_seams
 from .visible import blocked, hidden, on_top
-from .dividing import cut_at_walls
 
 SAMPLES = 256  # per texel
 LEAST, MOST = 16, 8192  # texels along a side
@@ -62,11 +62,7 @@ def lightmap(
     called with ("unwrap" | "gather", done, total).
     Raises RadiosityError for a size that is impossible or too small, and if a library is missing.
     """
-    if not LEAST <= size <= MOST:
-        raise RadiosityError(f"a lightmap of {size} texels is impossible: choose {LEAST} to {MOST}")
-    if samples < 1:
-        raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-    denoiser: Any = optional("mitsuba_oidn", "--denoise", "denoise") if denoise else None
+    check_budget(size, samples, denoise)
     progress("unwrap", 0, 1)
     atlas = unwrap(solution.model, whole(solution.model), size)
     where = spots(atlas)
@@ -75,9 +71,19 @@ def lightmap(
         where = spots(atlas)
     progress("unwrap", 1, 1)
     texels = _gather(solution, atlas, where, -(-samples // len(SPOTS)), seed, progress)
-    if denoiser is not None:
-        texels = _denoised(denoiser, texels)
-    return level_seams(solution.model, texels)
+    return level_seams(solution.model, _denoised(texels) if denoise else texels)
+
+
+def check_budget(size: int, samples: int, denoise: bool = False) -> None:
+    """Raise RadiosityError for a lightmap that could not be baked."""
+    if not LEAST <= size <= MOST:
+        raise RadiosityError(f"a lightmap of {size} x {size} texels is impossible: choose {LEAST} to {MOST}")
+    if samples < 1:
+        raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+    for module in ("xatlas", "scipy"):
+        optional(module, "a lightmap", "export")
+    if denoise:
+        optional("mitsuba_oidn", "denoising", "denoise")
 
 
 def _gather(solution, atlas, where, samples, seed, progress):
@@ -161,10 +167,9 @@ def _shifted(dy, dx):
     return (ty, tx), (hy, hx)
 
 
-def _denoised(denoiser, texels):
+def _denoised(texels):
     """Irradiance without noise; what is black stays black."""
-    from dataclasses import replace
-
+    denoiser: Any = optional("mitsuba_oidn", "denoising", "denoise")
     H = np.ascontiguousarray(texels.irradiance, dtype=np.float32)
     smooth = np.array(denoiser.denoise(H, hdr=True), dtype=np.float64)
     return replace(texels, irradiance=np.where(H > 0, np.maximum(smooth, 0), 0))

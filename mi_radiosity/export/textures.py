@@ -29,8 +29,13 @@ class Texture:
 
 def png(linear: np.ndarray) -> bytes:
     """Linear values in [0, 1] [height, width, 3] as a PNG file in sRGB."""
+    return png8(srgb8(linear))
+
+
+def png8(values: np.ndarray) -> bytes:
+    """Pixels (uint8 [height, width, 3]) as a PNG file."""
     stream = mi.MemoryStream()
-    mi.Bitmap(srgb8(linear)).write(stream, mi.Bitmap.FileFormat.PNG)
+    mi.Bitmap(np.ascontiguousarray(values)).write(stream, mi.Bitmap.FileFormat.PNG)
     return bytes(stream.raw_buffer())
 
 
