@@ -71,7 +71,8 @@ def lightmap(
         where = spots(atlas)
     progress("unwrap", 1, 1)
     texels = _gather(solution, atlas, where, -(-samples // len(SPOTS)), seed, progress)
-    return level_seams(solution.model, _denoised(texels) if denoise else texels)
+    light = _denoised(texels.irradiance) if denoise else texels.irradiance
+    return replace(texels, irradiance=level_seams(solution.model, atlas, light, texels.open))
 
 
 def check_budget(size: int, samples: int, denoise: bool = False) -> None:
@@ -167,9 +168,9 @@ def _shifted(dy, dx):
     return (ty, tx), (hy, hx)
 
 
-def _denoised(texels):
+def _denoised(irradiance):
     """Irradiance without noise; what is black stays black."""
     denoiser: Any = optional("mitsuba_oidn", "denoising", "denoise")
-    H = np.ascontiguousarray(texels.irradiance, dtype=np.float32)
+    H = np.ascontiguousarray(irradiance, dtype=np.float32)
     smooth = np.array(denoiser.denoise(H, hdr=True), dtype=np.float64)
-    return replace(texels, irradiance=np.where(H > 0, np.maximum(smooth, 0), 0))
+    return np.where(H > 0, np.maximum(smooth, 0), 0)

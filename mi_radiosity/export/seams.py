@@ -1,17 +1,13 @@
 """Seams of an atlas: where a smooth surface lies in two places, both show the same light."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..core.extras import optional
 from ..scene import Model
-from .atlas import Atlas, on_surface
+from .atlas import TUCK, Atlas, on_surface
 from .visible import blocked
-
-if TYPE_CHECKING:
-    from .lightmap import Lightmap
 
 SMOOTH = 0.99  # cosine between shading normals, above which a surface goes on
 STIFF = 100.0  # weight of a seam's texels being equal, against those of staying as gathered
@@ -19,31 +15,31 @@ LOOSE = 0.01  # weight of texels that were only filled
 PER_TEXEL = 2  # places along a seam
 
 
-def level_seams(model: Model, texels: "Lightmap") -> "Lightmap":
-    """The lightmap nearest to ``texels`` that is equal on both sides of seams.
+def level_seams(model: Model, atlas: Atlas, irradiance: np.ndarray, gathered: np.ndarray) -> np.ndarray:
+    """The irradiance nearest to the given [size, size, 3] that is equal on both sides of seams.
 
-    min Σ w (H − H₀)² + STIFF Σ (H_a − H_b)², over all texels, and over places along the seams.
+    min Σ w (H − H₀)² + STIFF Σ (H_a − H_b)², over all texels, and over places along the seams. gathered: which texels
+    were not only filled [size, size].
     """
-    a, b = seam_samples(model, texels.atlas)
+    a, b = seam_samples(model, atlas)
     if not len(a[0]):
-        return texels
+        return irradiance
     sparse: Any = optional("scipy.sparse", "a lightmap", "export")
     linalg: Any = optional("scipy.sparse.linalg", "a lightmap", "export")
-    n, size = len(a[0]), texels.atlas.size
+    n = len(a[0])
     row = np.repeat(np.arange(n), 4)
-    matrices = [sparse.csr_matrix((w.ravel(), (row, i.ravel())), shape=(n, size * size)) for i, w in (a, b)]
+    matrices = [sparse.csr_matrix((w.ravel(), (row, i.ravel())), shape=(n, atlas.size**2)) for i, w in (a, b)]
     difference = matrices[0] - matrices[1]
     involved = np.unique(difference.indices)
     D = difference[:, involved]
-    H = texels.irradiance.reshape(-1, 3)
-    weight = np.where(texels.open.ravel()[involved], 1.0, LOOSE)
+    weight = np.where(gathered.ravel()[involved], 1.0, LOOSE)
     system = (sparse.diags(weight) + STIFF * D.T @ D).tocsr()
-    result = H.copy()
+    result = irradiance.reshape(-1, 3).copy()
     for c in range(3):
-        start = H[involved, c]
+        start = result[involved, c]
         found, _ = linalg.cg(system, weight * start, x0=start, rtol=1e-6, maxiter=1000)
         result[involved, c] = np.maximum(found, 0)
-    return replace(texels, irradiance=result.reshape(texels.irradiance.shape))
+    return result.reshape(irradiance.shape)
 
 
 def seam_samples(model: Model, atlas: Atlas) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
@@ -55,7 +51,8 @@ def seam_samples(model: Model, atlas: Atlas) -> tuple[tuple[np.ndarray, np.ndarr
     t = (np.arange(len(which)) - np.repeat(np.cumsum(each) - each, each)) / np.maximum(each[which] - 1, 1)
     weights = [_along(side, which, s) for side, s in ((first, t), (second, np.where(flipped[which], 1 - t, t)))]
     ends = [on_surface(model, atlas, side[0][which], w)[:2] for side, w in zip((first, second), weights)]
-    apart = blocked(model, ends[0][0], ends[1][0], ends[0][1], ends[1][1])
+    # Over the edge between two facets, but through anything that stands on it.
+    apart = blocked(model, ends[0][0], ends[1][0], ends[0][1], ends[1][1], TUCK / atlas.per_metre)
     places = [
         np.einsum("nk,nkc->nc", w, atlas.place[side[0][which]])[~apart] for side, w in zip((first, second), weights)
     ]

@@ -45,11 +45,13 @@ def on_top(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return np.array(model.rays.on_top(owned(mi.UInt32, patch), u, v)).astype(bool)
 
 
-def blocked(model: Model, a: np.ndarray, b: np.ndarray, normal_a: np.ndarray, normal_b: np.ndarray) -> np.ndarray:
-    """Does anything stand between points a and b of surfaces [n, 3] (bool [n])?"""
+def blocked(
+    model: Model, a: np.ndarray, b: np.ndarray, normal_a: np.ndarray, normal_b: np.ndarray, height: float = 0.0
+) -> np.ndarray:
+    """Does anything stand between points a and b of surfaces [n, 3], ``height`` m above these (bool [n])?"""
     if not len(a):
         return np.zeros(0, dtype=bool)
-    ends = (_above(model, points, normals)[0] for points, normals in ((a, normal_a), (b, normal_b)))
+    ends = (_above(model, p + height * n, n)[0] for p, n in ((a, normal_a), (b, normal_b)))
     return np.array(model.rays.blocked(*ends)).astype(bool)
 
 
