@@ -51,11 +51,11 @@ class Field:
         for k, (color, point) in enumerate(zip(self._node_values(values), points)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
             dr.scatter(self._points, point, 6 * leaves + k)
-        self._walled = mi.Bool(self._exposure.crossed)
+        self._walled = dr.zeros(mi.Bool, n)
         walled = dr.full(mi.Bool, False, dr.width(leaves))
         for a, b in HALF_SIDES:  # both leaves of a side find the same
             walled |= self._rays.blocked(points[a], points[b], ~walled)
-        dr.scatter(self._walled, walled | dr.gather(mi.Bool, self._exposure.crossed, leaves), leaves)
+        dr.scatter(self._walled, walled | (self._dark_nodes != 0), leaves)
         dr.eval(self.nodes, self._points, self._walled)
 
     @property
