@@ -115,7 +115,8 @@ def _render_arguments(parser):
     _solve_arguments(parser.add_argument_group("solution"))
     add("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
     add("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
-    _shading_argument(parser)
+    _shading_argument(parser, "gather")
+    add("--denoise", action="store_true", help="remove the noise of the samples (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
     add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
     add("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")
@@ -204,9 +205,11 @@ def _definition(text):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import SHADERS, Shader, write_image
+    from .display import SHADERS, Shader, require_denoiser, write_image
 
     options = _solve_options(arguments)
+    if arguments.denoise:
+        require_denoiser()
     for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
         check_writable(path)
     scene = arguments.file.load()
@@ -216,7 +219,7 @@ def _render(arguments: argparse.Namespace) -> None:
         _keep(arguments, solution)
         for number, view in enumerate(views):
             report("render", number, len(views))
-            image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
+            image = solution.render(view, arguments.spp, arguments.shading, denoise=arguments.denoise)
             write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
     shader: type[Shader] = SHADERS.find(arguments.shading)
