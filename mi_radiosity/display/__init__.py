@@ -1,6 +1,6 @@
-"""Radiosity shown: shadings by name, a continuous field over the mesh, and the `radiosity` integrator."""
+"""Radiosity shown: shadings by name, and the `radiosity` integrator."""
 
-from .field import Field
+from ..solver import Field
 from .image import write_image
 from .integrator import register, render
 from .shaders import SHADERS, Flat, Gouraud, Look, Shader

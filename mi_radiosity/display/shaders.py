@@ -8,7 +8,6 @@ import mitsuba as mi
 from ..core.plugins import Registry
 from ..scene.rays import Hit
 from ..solver import Solution
-from .field import Field
 
 LINE_WIDTH = 1.0  # pixels
 LINE_SHADE = 0.25  # of the picture under an element outline
@@ -59,7 +58,7 @@ class Gouraud(Shader):
 
     def __init__(self, solution):
         super().__init__(solution)
-        self.field = Field(solution)
+        self.field = solution.field
 
     def irradiance(self, look):
         return self.field.at(look.leaf, look.hit.u, look.hit.v, look.lit)

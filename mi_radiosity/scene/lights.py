@@ -65,14 +65,28 @@ class Light:
             parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
         return b"".join(parts)
 
-    def lights_up(self, rays, x, normal, s, t, active=True):
-        """H at points x, relative to the patches' origin, with their normals: one `sample` each (Color3f [n])."""
+    def density(self, direction):
+        """Density of `sample` over directions, 1/sr, where rays that leave the scene see the lamp; else 0 (Float [n])."""
+        return mi.Float(0)
+
+    def share_of_rays(self, direction, cosine, rays_per_line):
+        """The balance heuristic's weight of cosine-distributed rays, of which there are so many per `sample` (None: there
+        are no samples), that see the lamp (Float [n])."""
+        if rays_per_line is None:
+            return mi.Float(1)
+        density, of_rays = self.density(direction), rays_per_line * dr.maximum(cosine, 0) * dr.inv_pi
+        return dr.select(density > 0, of_rays / (density + of_rays), 0)
+
+    def lights_up(self, rays, x, normal, s, t, active=True, rays_per_line=0.0):
+        """H at points x, relative to the patches' origin, with their normals: one `sample` each (Color3f [n]), weighed
+        against the rays that see the lamp."""
         direction, distance, irradiance = self.sample(x + rays.patches.origin, s, t)
         cosine = dr.dot(direction, normal)
         lit = active & (cosine > 0) & (dr.max(irradiance) > 0)
         start = x + normal * rays.patches.lift
         hidden = rays.blocked(start, start + direction * distance, lit)
-        return dr.select(lit & ~hidden, irradiance * cosine, 0)
+        share = 1 - self.share_of_rays(direction, cosine, rays_per_line)
+        return dr.select(lit & ~hidden, irradiance * cosine * share, 0)
 
 
 class Area(Light):
@@ -139,6 +153,13 @@ class Infinite(Free):
         "TimedSunskyEmitter",
     )
 
+    def density(self, direction):
+        if not self.emitter.is_environment():
+            return mi.Float(0)
+        sample = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+        sample.d = direction
+        return self.emitter.pdf_direction(dr.zeros(mi.Interaction3f), sample)
+
     def shoot(self, x, y, s, t):
         low, high = (mi.Vector3f(*(dr.opaque(mi.Float, c) for c in corner)) for corner in (self.low, self.high))
         size = high - low
@@ -193,7 +214,7 @@ class Lights:
     """
 
     def __init__(self, faces):
-        self._faces, self._environment = faces, faces.scene.environment()
+        self._faces = faces
         emitters = [part.shape.emitter() for part in faces.parts]
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
         self._kinds = list(dict.fromkeys(kind for kind in kinds if kind and kind.on_surface))
@@ -251,26 +272,26 @@ class Lights:
         values = self.exitance_at(face, u0 + scale * a, v0 + scale * b)
         return mi.Color3f(*(dr.block_sum(x + dr.zeros(mi.Float, dr.width(k)), points) / mi.Float(each) for x in values))
 
-    def seen(self, patches, hit, active=True):
-        """E where rays meet patches, as it is at that point (Color3f [n])."""
-        mean = dr.gather(mi.Color3f, patches.emission, hit.patch, active)
+    def at(self, patches, patch, u, v, active=True):
+        """E at points of patches (Color3f [n])."""
+        mean = dr.gather(mi.Color3f, patches.emission, patch, active)
         if not self.textured:
             return mean
         shines = active & (dr.max(mean) > 0)
-        return self.exitance_at(dr.gather(mi.UInt32, patches.face, hit.patch, shines), hit.u, hit.v, shines)
+        return self.exitance_at(dr.gather(mi.UInt32, patches.face, patch, shines), u, v, shines)
 
     def sky(self, direction, active=True):
         """E = π L of what rays see that leave the scene in a direction (Vector3f ─► Color3f [n])."""
-        if self._environment is None:
+        if self.sky_light is None:
             return mi.Color3f(0)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        return dr.pi * dr.select(active, mi.Color3f(self._environment.eval(si, active)), 0)
+        return dr.pi * dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
 
     @property
-    def has_sky(self) -> bool:
-        """Do rays that leave the scene see anything?"""
-        return self._environment is not None
+    def sky_light(self):
+        """The lamp that rays see which leave the scene, or None."""
+        return next((light for light in self.free if light.emitter.is_environment()), None)
 
 
 def varies(emitter) -> bool:

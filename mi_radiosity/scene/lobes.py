@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..core.arrays import NONE, owned
+from ..core.arrays import NONE
 from ..core.points import ROUNDS
 
 ROULETTE = 5  # lobes after which a ray may end by chance
@@ -39,13 +38,7 @@ class Trail:
 
 
 class Lobes:
-    """Follows rays in a scene some of whose shapes have lobes that are not diffuse.
-
-    traced (bool [shapes]): which of them.
-    """
-
-    def __init__(self, traced: np.ndarray) -> None:
-        self._traced = owned(mi.UInt32, traced)
+    """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
 
     def follow(self, rays, ray, number, seed, mode, camera, active=True):
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.

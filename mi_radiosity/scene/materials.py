@@ -60,11 +60,11 @@ class Materials:
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
 
-    def is_traced(self, face):
+    def is_traced(self, face, active=True):
         """Do faces have lobes that are traced (Bool [n])?"""
         if not self.traced.any():
             return mi.Bool(False)
-        return dr.gather(mi.UInt32, self._traced_faces, face) != 0
+        return dr.gather(mi.UInt32, self._traced_faces, face, active) != 0
 
     def _find_albedos(self, textured):
         """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE, owned, owned_vectors
+from ..core.arrays import NONE, owned_vectors
 from ..core.points import cosine_direction
 from .lobes import Lobes
 from .patches import patch_table
@@ -19,6 +19,7 @@ class Hit:
     patch: "mi.UInt32"  # [rays]
     u: "mi.Float"  # [rays] barycentric coordinates on the face
     v: "mi.Float"
+    back: "mi.Bool"  # [rays] the side they meet is the back of its face
     traced: "mi.Bool"  # [rays] the surface has lobes that are not diffuse
 
 
@@ -27,10 +28,10 @@ class Rays:
 
     def __init__(self, faces, patches, materials, overlaps=None):
         self.scene, self.patches = faces.tracing, patches
-        self._traced = owned(mi.UInt32, materials.traced) if materials.traced.any() else None
-        self.lobes = Lobes(materials.traced) if materials.traced.any() else None
+        self._materials = materials
+        self.lobes = Lobes() if materials.traced.any() else None
         self._first_face = faces.first_face
-        self._front = owned_vectors(mi.Vector3f, faces.normal)
+        self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
 
@@ -48,15 +49,16 @@ class Rays:
         """Name the patches that intersections lie on."""
         valid = prelim.is_valid()
         face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
-        back = dr.dot(dr.gather(mi.Vector3f, self._front, face, valid), direction) > 0
-        u, v = prelim.prim_uv.x, prelim.prim_uv.y
+        back = dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
+        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid)
+
+    def side(self, face, back, u, v, valid) -> Hit:
+        """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
         patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        traced = mi.Bool(False)
-        if self._traced is not None:
-            traced = dr.gather(mi.UInt32, self._traced, prelim.shape_index, valid) != 0
-        return Hit(valid, dr.select(valid, patch, NONE), u, v, traced)
+        traced = valid & self._materials.is_traced(face, valid)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v, back, traced)
 
     def follow(self, origin, direction, number, seed, power=False, camera=False, active=True):
         """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.

@@ -29,7 +29,7 @@ def reached(rays, lights):
     source, target = np.concatenate([a for a, _ in links]), np.concatenate([b for _, b in links])
     source, target = source[target != NONE], target[target != NONE]
     lit = emits | _see_free(rays, lights)
-    if lights.has_sky:
+    if lights.sky_light:
         lit |= escaped.reshape(patches.count, PROBES).any(axis=1)
     label = components(patches.count, source, target)
     return np.isin(label, label[lit])

@@ -1,23 +1,28 @@
 """What a solve leaves behind."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, opaque_index, owned, owned_vectors
+from ..core.arrays import NONE, owned, owned_vectors
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
-from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed, uniform
 from ..mesh import Elements, Exposure
 from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
 from ..scene import Model
+from ..scene.nearest import nearest_face
+from ..scene.patches import lift_of
 from ..transport import Gatherer
 from ..transport.landings import Landings
+from ..transport.probe import probe
+from .field import Field
 
 FORMAT = 3
 TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
@@ -63,23 +68,76 @@ class Solution:
     landings: Landings
     stats: dict
 
-    def irradiance(self, points=None, normals=None, *, lux: bool = False, samples: int = 1024, seed: int = 0):
+    def irradiance(
+        self,
+        points=None,
+        normals=None,
+        *,
+        lux: bool = False,
+        samples: int = 1024,
+        seed: int = 0,
+        return_error: bool = False,
+        progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    ):
         """Irradiance H at any points of the scene, gathered there: W/m² per channel (NumPy [n, 3]), or with ``lux``
         illuminance, lx (NumPy [n]): 179 lm/W times the luminance of H by Rec. 709's weights.
 
-        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps, and
-        as many rays into the room, per point. Without points: H of all elements (Color3f [elements]).
+        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps,
+        and as many rays into the room, per point, rounded up to a multiple of 16. With ``return_error`` the result is
+        a pair: the values and their standard errors, which are rather too large than too small, and do not know of
+        the errors of the solution. Without points: H of all elements (Color3f [elements]).
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
             return self.direct + self.indirect
         points, normals = _checked_points(points, normals)
-        gathered = self._gather(points, normals, samples, seed) if len(points) else np.zeros((0, 3))
-        return LUMENS_PER_WATT * gathered @ LUMINANCE if lux else gathered
+        if samples < 1:
+            raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+        gatherer = Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+        report = partial(progress, "gather")
+        found = probe(gatherer, self.model, points, normals, samples, seed, lambda done: report(done, len(points)))
+        if lux:
+            # The channels' errors go together, as their samples are the same.
+            found = tuple(LUMENS_PER_WATT * values @ LUMINANCE for values in found)
+        return found if return_error else found[0]
 
-    def radiosity(self):
-        """B = E + ρ H, W/m² (Color3f [elements])."""
-        return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+    def radiosity(self, points=None, normals=None):
+        """B = E + ρ H, W/m², of the continuous field on the surface nearest to each point (NumPy [n, 3]); NaN for
+        points farther from all than 1 % of the scene's diagonal.
+
+        points [n, 3] in m; normals [n, 3], of any length: which side of a surface is meant; by default the front, or
+        the back if light reaches only that. Without points: B of all elements (Color3f [elements]).
+        Raises RadiosityError for points or normals that are not finite, or do not fit together.
+        """
+        if points is None:
+            return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+        points, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
+        if len(points) == 0:
+            return np.zeros((0, 3))
+        model, rays = self.model, self.model.rays
+        given = 0 * given if normals is None else given
+        face, u, v, near = nearest_face(model.faces, points, given, lift_of(model.faces))
+        facing = dr.dot(owned_vectors(mi.Vector3f, given), dr.gather(mi.Vector3f, rays.front, face))
+        front, back = (rays.side(face, dr.full(mi.Bool, side, len(points)), u, v, near) for side in (False, True))
+        behind = facing < 0 if normals is not None else front.patch == NONE
+        hit = dr.select(behind, back, front)
+        return np.where(np.array(near)[:, None], np.array(self._shown_radiosity(hit)).T, np.nan)
+
+    def _shown_radiosity(self, hit):
+        """B where something meets patches, 0 where not (Color3f [n])."""
+        patches, lit = self.model.patches, hit.patch != NONE
+        patch = dr.select(lit, hit.patch, 0)
+        leaf = self.elements.leaf_at(patch, hit.u, hit.v, lit)
+        rho = dr.gather(mi.Color3f, patches.reflectance, patch)
+        if self.model.materials.textured:
+            rho = self.model.materials.reflectance_at(dr.gather(mi.UInt32, patches.face, patch), hit.u, hit.v, hit.back)
+        B = dr.gather(mi.Color3f, patches.emission, patch) + rho * self.field.at(leaf, hit.u, hit.v, lit)
+        return dr.select(lit, B, 0)
+
+    @cached_property
+    def field(self) -> Field:
+        """H as a continuous field over the surfaces."""
+        return Field(self)
 
     def _reflected(self):
         return self.elements.reflectance * self.irradiance()
@@ -120,27 +178,6 @@ class Solution:
         """Raise RadiosityError if the scene is not as it was when it was solved."""
         if not self.model.state.same_as(self.model.scene):
             raise RadiosityError("the scene has been edited since it was solved: solve it again")
-
-    def _gather(self, points, normals, samples, seed):
-        patches = self.model.patches
-        gatherer = Gatherer(self.model, self.elements, self._reflected())
-        each, n = opaque_index(samples), len(points)
-        total, at_once = np.zeros((n, 3)), max(1, (1 << 22) // samples)
-        stream = opaque_index(stream_seed(seed, Stream.MEASURE))
-        for first in range(0, n, at_once):
-            part = slice(first, min(first + at_once, n))
-            k = dr.arange(mi.UInt32, (part.stop - first) * samples)
-            of, line = k // each, k % each
-            x = dr.gather(mi.Point3f, owned_vectors(mi.Point3f, points[part] - self.model.faces.centre), of)
-            normal = dr.gather(mi.Vector3f, owned_vectors(mi.Vector3f, normals[part]), of)
-            key = hash_pair(of + opaque_index(first), 0)
-            a, b, s, t = kronecker(line, key, stream)
-            lot = (mi.Float(line) + uniform(key ^ 0xA511E9B3, stream)) / mi.Float(each)
-            origin = x + patches.origin + normal * patches.lift
-            room = gatherer.indirect(origin, cosine_direction(normal, s, t), k + opaque_index(first * samples), stream)
-            H = gatherer.direct(x, normal, lot, a, b) + room
-            total[part] = np.array([dr.block_sum(c, samples) for c in H]).T / samples
-        return total
 
     # ---- Files ---------------------------------------------------------------------------------
 

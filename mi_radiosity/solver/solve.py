@@ -12,7 +12,7 @@ from ..core.points import Stream, stream_seed
 from ..mesh import Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
-from ..transport import PILOT, Problem, Shooting, Starved, Transport
+from ..transport import PILOT, Gathering, Problem, Shooting, Transport
 from .refine import Refinement
 from .solution import Solution
 
@@ -74,16 +74,17 @@ def solve(
     clock.lap("refine")
 
     rays = int(rays or RAYS_PER_ELEMENT * tree.leaf_count)
-    starved = Starved(problem, rays, seed)
+    gathering = Gathering(problem, rays, seed)
+    shot = rays - gathering.rays
     flow = transport(
         problem,
-        rays - starved.rays,
+        shot,
         stream_seed(seed, Stream.POWER),
         refinement.first_share,
-        lambda done: report("distribute", done + starved.rays, rays),
+        lambda done: report("distribute", done, rays),
     )
+    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
     power = _balance(problem, flow)
-    flow = starved.feed(flow)
     clock.lap("distribute")
 
     stats = {
@@ -91,6 +92,8 @@ def solve(
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
         "rays": flow.rays,
+        "power_rays": shot,
+        "gather_rays": gathering.rays,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0,
         "pilot_rays": refinement.rays,
         "iterations": flow.iterations,

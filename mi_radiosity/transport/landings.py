@@ -3,7 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import owned
+from ..core.arrays import NONE, owned
 from ..core.points import hash_pair
 
 SEATS = 16  # points kept per leaf; a power of two
@@ -59,3 +59,22 @@ class Landings:
         down (two Float [n])."""
         seat = SEATS * slot + number % SEATS
         return tuple(dr.gather(mi.Float, x, seat, active) for x in (self.u, self.v))
+
+    def any_on(self, slot, active):
+        """Did light come down on crossed leaves of these slots, NONE for other leaves (Bool [n])?"""
+        if self.slots == 0:
+            return mi.Bool(False)
+        asked = active & (slot != NONE)
+        return asked & ~dr.isnan(self.points(slot, mi.UInt32(0), asked)[0])
+
+    def in_sight(self, elements, rays, leaf, slot, x, active):
+        """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
+        patch = dr.gather(mi.UInt32, elements.patch, leaf, active)
+
+        def look(found, k):
+            u, v = self.points(slot, k, active)
+            asked = active & ~found
+            return found | (asked & ~rays.blocked(x, elements.patches.above(patch, u, v), asked)), k + 1
+
+        found = mi.Bool(active & False)
+        return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]

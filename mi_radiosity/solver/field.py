@@ -7,7 +7,6 @@ from ..core.arrays import NONE, ColorSums, totals
 from ..mesh.exposure import node_point
 from ..mesh.subdivision import HALF_SIDES, child_at, child_corner, child_point
 from ..mesh.vertices import Vertices
-from ..transport.landings import SEATS
 
 FAINT = 1e-4  # weight below which a node has no say
 SHARPEN = 1  # rounds in which vertices make up for what averaging took from the elements
@@ -89,29 +88,10 @@ class Field:
             return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
         own = dr.gather(mi.Color3f, self.flat, leaf, active)
-        landed = self._has_landings(slot, active)
-        return dr.select(self._light_in_sight(leaf, slot, x, landed), own, dr.select(landed, 0, total))
-
-    def _has_landings(self, slot, active):
-        """Did light come down on crossed leaves of these slots (Bool [n])?"""
-        landings, asked = self._solution.landings, active & (slot != NONE)
-        return asked & ~dr.isnan(landings.points(slot, mi.UInt32(0), asked)[0])
-
-    def _light_in_sight(self, leaf, slot, x, active):
-        """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
-        e, landings = self._elements, self._solution.landings
-        if not landings.slots:
-            return mi.Bool(False)
-        patch = dr.gather(mi.UInt32, e.patch, leaf, active)
-
-        def look(found, k):
-            u, v = landings.points(slot, k, active)
-            return found | (
-                active & ~found & ~self._rays.blocked(x, e.patches.above(patch, u, v), active & ~found)
-            ), k + 1
-
-        found = mi.Bool(active & False)
-        return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]
+        landings = self._solution.landings
+        landed = landings.any_on(slot, active)
+        seen = landings.in_sight(self._elements, self._rays, leaf, slot, x, landed)
+        return dr.select(seen, own, dr.select(landed, 0, total))
 
     # ---- Building ------------------------------------------------------------------------------
 
@@ -120,13 +100,15 @@ class Field:
         dark = dr.zeros(mi.UInt32, dr.width(leaves))
         if self._solution.landings.slots == 0:
             return dark
-        chosen = dr.compress(self._has_landings(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
+        landings = self._solution.landings
+        chosen = dr.compress(landings.any_on(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
         if dr.width(chosen) == 0:
             return dark
         leaf, bits = dr.gather(mi.UInt32, leaves, chosen), mi.UInt32(0)
         slot, every = dr.gather(mi.UInt32, self._exposure.slot, leaf), dr.full(mi.Bool, True, dr.width(leaf))
         for node in range(6):
-            seen = self._light_in_sight(leaf, slot, node_point(self._elements, leaf, node), every)
+            point = node_point(self._elements, leaf, node)
+            seen = landings.in_sight(self._elements, self._rays, leaf, slot, point, every)
             bits |= dr.select(seen, mi.UInt32(0), 1 << node)
         dr.scatter(dark, bits, chosen)
         dr.eval(dark)
