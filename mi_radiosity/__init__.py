@@ -10,6 +10,8 @@ from .core.errors import RadiosityError
 from .core.plugins import welcome_installed as _welcome_installed
 from .display import Shader
 from .display import register as _register
+from .export import export
+from .export import view as _view
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
 from .solver import Solution, solve
@@ -31,10 +33,13 @@ __all__ = [
     "Solution",
     "Transport",
     "Uniform",
+    "export",
     "information_gap",
     "mesher",
     "solve",
 ]
+
+Solution.view = _view  # type: ignore[attr-defined]  # rooms below do not know of this one
 
 
 def _follow_variant(*_: object) -> None:

@@ -28,6 +28,7 @@ class Stream(IntEnum):
     REACH = 5  # rays that look for light while a scene is read
     MEASURE = 6  # irradiance at points of the user's
     ALBEDO = 7  # directions that the albedo of a diffuse lobe is found with
+    PIXELS = 9  # camera samples
     LOBES = 8  # what lobes rays draw on their way
 
 

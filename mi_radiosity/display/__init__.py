@@ -3,6 +3,19 @@
 from ..solver import Field
 from .image import write_image
 from .integrator import register, render
+from .lux import Lux, lux_scale
 from .shaders import SHADERS, Flat, Gouraud, Look, Shader
 
-__all__ = ["SHADERS", "Field", "Flat", "Gouraud", "Look", "Shader", "register", "render", "write_image"]
+__all__ = [
+    "SHADERS",
+    "Field",
+    "Flat",
+    "Gouraud",
+    "Look",
+    "Lux",
+    "Shader",
+    "lux_scale",
+    "register",
+    "render",
+    "write_image",
+]

@@ -9,6 +9,7 @@ from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import Solution, solve
+from .pixels import picture
 from .shaders import SHADERS, Look
 
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
@@ -37,7 +38,6 @@ def _integrator_class():
                 if name in props:
                     self.options[name] = kind(props.get(name))
             self.progress = None
-            self._pixel = 1.0
             self._forget()
 
         def _forget(self):
@@ -76,9 +76,8 @@ def _integrator_class():
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            # Mitsuba shrinks ray differentials to the spacing of samples.
-            self._pixel = (spp or chosen.sampler().sample_count()) ** 0.5
-            return super().render(scene, chosen, seed, spp, develop, evaluate)
+            seed = int(seed[0] if dr.is_array_v(seed) else seed)
+            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self.sample, develop)
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)
@@ -101,7 +100,7 @@ def _integrator_class():
             reflectance = _reflectance(model, prelim, ray, hit, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
             emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, emits)
-            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler, dr.opaque(mi.Float, self._pixel))
+            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
             if model.lights.sky_light and not self.hide_emitters:
                 direction = ray.d if rays.lobes is None else hit.direction

@@ -17,7 +17,8 @@ class Faces:
     ``tracing``: the scene itself, or one in which every shape is a mesh; ``parts``: what its shapes stand for. Arrays
     over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
     ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
-    corners) and ``rank`` (its place in an order that only geometry decides); ``centre`` [3] of the scene.
+    corners) and ``rank`` (its place in an order that only geometry decides); ``centre`` [3] of the
+    scene; ``smooth``: some shapes have vertex normals.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -27,6 +28,7 @@ class Faces:
         if not scene.shapes():
             raise RadiosityError("the scene has no shapes: nothing can be lit")
         self.tracing, self.parts = tracing_scene(scene)
+        self.smooth = any(mesh.has_vertex_normals() for mesh in self.tracing.shapes())
         self._read(*_corners(self.tracing))
         self._orient()
 

@@ -49,13 +49,14 @@ class Overlaps:
 
 
 class Lookup:
-    """Overlaps as tables on the device."""
+    """Overlaps as tables on the device; ``under`` and ``over`` as there."""
 
     def __init__(self, overlaps, centre):
         corner = overlaps.corners - centre
         edges = [corner[:, k] - corner[:, 0] for k in (1, 2)]
         self._triangles = [owned_vectors(mi.Point3f, corner[:, 0]), *(owned_vectors(mi.Vector3f, e) for e in edges)]
         self._starts = owned(mi.UInt32, np.searchsorted(overlaps.under, np.arange(overlaps.covered.size + 1)))
+        self.under, self.over = overlaps.under, overlaps.over
         self._over = owned(mi.UInt32, overlaps.over)
 
     @dr.syntax
@@ -101,7 +102,7 @@ def find_overlaps(faces, present, exitance, reflectance, tolerance) -> Overlaps:
 
 def _precedence(faces, present, exitance, reflectance):
     """Place of every side in the order in which points belong to sides (int [2 · faces])."""
-    surface = _surfaces(faces.corners, faces.normal)
+    surface = surfaces(faces.corners, faces.normal)
     size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
     first = np.full(surface.max() + 1, len(faces))
     np.minimum.at(first, surface, faces.rank)
@@ -193,8 +194,9 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
             yield f[near], g[near]
 
 
-def _surfaces(corners, normal):
-    """A number per face, the same for faces joined by edges, within one plane, that they run along in opposite directions (int [faces])."""
+def surfaces(corners, normal):
+    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions
+    (int [faces])."""
     n = len(corners)
     _, vertex = np.unique(np.round(corners.reshape(-1, 3), 12), axis=0, return_inverse=True)
     vertex = vertex.reshape(n, 3).astype(np.int64)

@@ -22,27 +22,30 @@ class Field:
     Where a wall stands on a leaf, each side of it is shown by the nodes on that side that light came down in sight
     of; and where there is none, by the leaf's own value if light came down in sight of the point itself.
 
-    nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
+    irradiance: of the elements (Color3f [elements]), by default all of the solution's.
+    vertices: the Vertices of the mesh, with values (Color3f [vertices]). nodes: six Color3f per element,
+    [6 · elements]. NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution):
+    def __init__(self, solution, irradiance=None):
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
-        self.flat = solution.direct + solution.indirect
+        self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
         leaves = self._elements.leaves
         H = dr.gather(mi.Color3f, self.flat, leaves)
-        self._vertices = Vertices(solution.model, self._elements)
-        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0)
+        self.vertices = Vertices(solution.model, self._elements)
+        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0) | self._nodes_behind_walls(leaves)
         values = self._spread(H)
         for _ in range(SHARPEN):
             lost = dr.select(self._dark_nodes == 0, H - self._mean(values), 0)
             values = dr.maximum(values + self._spread(lost), 0)
-        self._store(self._straightened(values))
+        self.values = self._straightened(values)
+        self._store(self.values)
 
     def _store(self, values):
         n, leaves = len(self._elements), self._elements.leaves
         self.nodes, self._points = dr.full(mi.Color3f, dr.nan, 6 * n), dr.zeros(mi.Point3f, 6 * n)
-        points = self._vertices.nodes(self._vertices.point, self._half_way)
+        points = self.vertices.nodes(self.vertices.point, self._half_way)
         for k, (color, point) in enumerate(zip(self._node_values(values), points)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
             dr.scatter(self._points, point, 6 * leaves + k)
@@ -57,6 +60,11 @@ class Field:
     def walled(self):
         """Which leaves does a wall stand on (Bool [elements])?"""
         return self._walled
+
+    @property
+    def of_leaves(self):
+        """H of the leaves themselves (Color3f [leaves])."""
+        return dr.gather(mi.Color3f, self.flat, self._elements.leaves)
 
     # ---- Looking up ----------------------------------------------------------------------------
 
@@ -114,13 +122,28 @@ class Field:
         dr.eval(dark)
         return dark
 
+    def _nodes_behind_walls(self, leaves):
+        """Nodes of leaves whose vertex stands on the other side of a wall, where leaves of one plane meet, a bit for
+        each (UInt32 [leaves])."""
+        patches, bits = self._elements.patches, dr.zeros(mi.UInt32, dr.width(leaves))
+        normal = dr.gather(mi.Vector3f, patches.normal, dr.gather(mi.UInt32, self._elements.patch, leaves))
+        for node, vertex in enumerate((*self.vertices.corner, *self.vertices.middle)):
+            index = dr.gather(mi.UInt32, vertex, leaves)
+            there = dr.gather(mi.Point3f, self.vertices.point, index, index != NONE)
+            here = node_point(self._elements, leaves, node)
+            level = (index != NONE) & (dr.abs(dr.dot(there - here, normal)) < 0.25 * patches.lift)
+            hidden = self._rays.blocked(here, there, level)
+            bits |= dr.select(hidden, mi.UInt32(1 << node), 0)
+        dr.eval(bits)
+        return bits
+
     def _spread(self, H):
         """Vertex values from leaf values: averages over the leaves around (Color3f [vertices]).
 
         A leaf counts by its angle at the vertex over its size, which is right for linear fields next
         to a hanging vertex, and by the share of it that is open; not at all at vertices away from its light.
         """
-        e, v = self._elements, self._vertices
+        e, v = self._elements, self.vertices
         area = dr.gather(mi.Float, e.area, e.leaves)
         size, share = dr.sqrt(area), self._exposure.open_share(e, e.leaves)
         bound = [2 * t for t in totals([mi.Float64(dr.abs(h)) / mi.Float64(size) * 16 for h in H])]
@@ -141,7 +164,7 @@ class Field:
 
     def _straightened(self, values):
         """``values`` with hanging vertices on the line between the ends of their side."""
-        for vertex, low, high in self._vertices.straight:
+        for vertex, low, high in self.vertices.straight:
             dr.scatter(values, self._between(values, low, high, True), vertex)
             dr.eval(values)
         return values
@@ -150,7 +173,7 @@ class Field:
         """The value in the middle of straight sides: the mean of the ends, or that of the one that is in sight, and
         known of (Color3f [n])."""
         a, b = (dr.gather(mi.Color3f, values, end) for end in (low, high))
-        start, end = (dr.gather(mi.Point3f, self._vertices.point, k) for k in (low, high))
+        start, end = (dr.gather(mi.Point3f, self.vertices.point, k) for k in (low, high))
         middle = 0.5 * (start + end)
         no_a, no_b = (self._rays.blocked(middle, x, active) for x in (start, end))
         # NaN where the only end in sight is one that nothing is known of.
@@ -158,12 +181,12 @@ class Field:
 
     def _half_way(self, low, high, active):
         return 0.5 * (
-            dr.gather(mi.Point3f, self._vertices.point, low) + dr.gather(mi.Point3f, self._vertices.point, high)
+            dr.gather(mi.Point3f, self.vertices.point, low) + dr.gather(mi.Point3f, self.vertices.point, high)
         )
 
     def _node_values(self, values):
         """The six node values of every leaf (six Color3f [leaves])."""
-        return self._vertices.nodes(values, lambda low, high, active: self._between(values, low, high, active))
+        return self.vertices.nodes(values, lambda low, high, active: self._between(values, low, high, active))
 
     def _mean(self, values):
         """Mean of the displayed field over each leaf (Color3f [leaves])."""

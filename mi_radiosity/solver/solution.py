@@ -93,7 +93,7 @@ class Solution:
         points, normals = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-        gatherer = Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+        gatherer = self.gatherer()
         report = partial(progress, "gather")
         found = probe(gatherer, self.model, points, normals, samples, seed, lambda done: report(done, len(points)))
         if lux:
@@ -139,6 +139,10 @@ class Solution:
         """H as a continuous field over the surfaces."""
         return Field(self)
 
+    def gatherer(self) -> Gatherer:
+        """What gathers irradiance at any places, by this solution's radiosity."""
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
+
     def _reflected(self):
         return self.elements.reflectance * self.irradiance()
 
@@ -181,8 +185,11 @@ class Solution:
 
     # ---- Files ---------------------------------------------------------------------------------
 
-    def save(self, path) -> None:
-        """Write the solution as NumPy archive (.npz); no file is left half-written."""
+    def save(self, path, source: dict | None = None) -> None:
+        """Write the solution as NumPy archive (.npz); no file is left half-written.
+
+        source: where the scene came from, for `source_of` to tell.
+        """
         e = self.elements
         arrays = {name: np.array(getattr(e, name)) for name in TREE}
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
@@ -196,8 +203,18 @@ class Solution:
                 fingerprint=self.model.fingerprint,
                 sides=self.model.patches.sides,
                 stats=json.dumps(self.stats),
+                source=json.dumps(source),
                 **arrays,
             )
+
+    @staticmethod
+    def source_of(path) -> dict | None:
+        """Where the scene of a kept solution came from, as `save` was told; None if it was not.
+
+        Raises RadiosityError if the file is no solution, or is damaged.
+        """
+        data, _ = _read(path)
+        return json.loads(str(data["source"])) if "source" in data else None
 
     @staticmethod
     def load(path, scene: "mi.Scene | Model") -> "Solution":

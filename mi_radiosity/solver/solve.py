@@ -83,8 +83,8 @@ def solve(
         refinement.first_share,
         lambda done: report("distribute", done, rays),
     )
-    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
     power = _balance(problem, flow)
+    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
     clock.lap("distribute")
 
     stats = {
@@ -154,9 +154,9 @@ class _Clock:
 
 
 def _balance(problem, flow):
-    """Emitted, absorbed, escaped and unshot power in W, channels added up.
+    """Emitted, absorbed, escaped and unshot power of a transport in W, channels added up.
 
-    What is absorbed comes from the irradiance of the solution, not from counting rays.
+    What is absorbed comes from its irradiance, not from counting rays.
     """
     leaves, elements = problem.elements.leaves, problem.elements
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)

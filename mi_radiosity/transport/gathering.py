@@ -17,7 +17,6 @@ from .landings import Landings
 SHARE = 0.8  # of the rays are gathered with; the others find the radiosity that is gathered
 RAYS_PER_LINE = 2  # rays into the room per line to the lamps
 LEAST = 16  # lines per leaf, or half of the mean
-MOST_ESCAPED = 0.5  # of the power of a scene with lamps that are no surface, for its total to be trusted
 
 
 class Gathering:
@@ -28,7 +27,7 @@ class Gathering:
     has it. Large leaves get more, by the fourth root of their area, which was found best. ``rays`` is what the pass
     costs; 0 where the budget has none to spare: then what was shot is shown.
 
-    What is shot keeps all power to the letter; where its total is exact, or nearly so, what is gathered is scaled to it.
+    What is shot keeps all power to the letter: what is gathered is scaled to its total, as far as that is known better.
     """
 
     def __init__(self, problem, budget: int, seed: int) -> None:
@@ -65,20 +64,24 @@ class Gathering:
         row = dr.arange(mi.UInt32, dr.width(e.leaves))
         for name, sums in (("direct", direct), ("indirect", indirect)):
             values = [c / lines * mi.Float64(whole) for c in sums.gather(row)]
-            values = self._scaled(values, getattr(flow, name), sum(flow.escaped) / sum(flow.emitted))
-            fields[name] = pull(e, values, exposure.open_area)
+            fields[name] = pull(e, self._scaled(values, flow, name), exposure.open_area)
         return dataclasses.replace(flow, rays=flow.rays + self.rays, landings=self._landings.settled(), **fields)
 
-    def _scaled(self, gathered, shot, escaped):
-        """Gathered irradiance (3 Float64 [leaves]) that is absorbed in all as what was shot is (Color3f [elements])."""
+    def _scaled(self, gathered, flow, name):
+        """Gathered irradiance (3 Float64 [leaves]) that is absorbed in all as what was shot is, as far as that can be
+        trusted: in closed rooms, where no ray is lost, its total is exact."""
         e = self._problem.elements
-        if self._problem.model.lights.free and escaped > MOST_ESCAPED:
-            return gathered  # few rays of a sky that were shot came in, and gathering knows better
         area = mi.Float64(dr.gather(mi.Float, self._problem.exposure.open_area, e.leaves))
         kept = [area * (1 - mi.Float64(r)) for r in dr.gather(mi.Color3f, e.reflectance, e.leaves)]
+        shot = dr.gather(mi.Color3f, getattr(flow, name), e.leaves)
         have = totals([h * k for h, k in zip(gathered, kept)])
-        want = totals([mi.Float64(h) * k for h, k in zip(dr.gather(mi.Color3f, shot, e.leaves), kept)])
-        return [h * dr.opaque(mi.Float64, w / t if t > 0 else 1.0) for h, w, t in zip(gathered, want, have)]
+        want = totals([mi.Float64(h) * k for h, k in zip(shot, kept)])
+        lost = min(sum(flow.escaped) / sum(flow.emitted), 1 - 1e-6)
+        # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
+        noise = lost / (1 - lost) / max(flow.rays * flow.first_share, 1)
+        trust = 1 / (1 + noise * self._count)
+        factors = [1 + trust * (w / t - 1) if t > 0 else 1.0 for w, t in zip(want, have)]
+        return [h * dr.opaque(mi.Float64, f) for h, f in zip(gathered, factors)]
 
     def _bound(self, flow):
         """More than the samples of all leaves can add up to."""

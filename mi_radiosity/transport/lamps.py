@@ -63,7 +63,7 @@ class LampChoice:
         if leaf is None or self._rows is None:
             number = self._by_power.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._by_power.whole))
         else:
-            first = dr.gather(mi.UInt32, self._row, leaf) * self.count
+            first = self._first(leaf)
             last = first + opaque_index(self.count - 1)
             top = dr.gather(mi.Float, self._rows, last)
             number = lower_bound_within(self._rows, lot * top, first, last) - first
@@ -75,11 +75,16 @@ class LampChoice:
         is_lamp = active & (number != NONE)
         return dr.select(is_lamp, self._density(dr.select(is_lamp, number, 0), leaf), 0)
 
+    def _first(self, leaf):
+        """Where the rows of leaves begin; for other elements, which nobody looks at, the first (UInt32 [n])."""
+        row = dr.gather(mi.UInt32, self._row, leaf)
+        return dr.select(row == NONE, 0, row) * opaque_index(self.count)
+
     def _density(self, number, leaf):
         if leaf is None or self._rows is None:
             probability = mi.Float(self._by_power.probability(number))
         else:
-            first = dr.gather(mi.UInt32, self._row, leaf) * self.count
+            first = self._first(leaf)
             at = first + number
             before = dr.gather(mi.Float, self._rows, at - 1, number > 0)
             top = dr.gather(mi.Float, self._rows, first + opaque_index(self.count - 1))

@@ -1,0 +1,7 @@
+"""A solution taken home: measured, as a mesh for other programs, as a scene that shines by itself, as a page to walk in."""
+
+from .api import WRITERS, export
+from .geometry import LitMesh, lit_mesh
+from .page import view, write_page
+
+__all__ = ["WRITERS", "LitMesh", "export", "lit_mesh", "view", "write_page"]
