@@ -52,7 +52,7 @@ def solve(
     report, clock = progress or (lambda stage, done, total: None), _Clock()
 
     model = scene if isinstance(scene, Model) else Model(scene)
-    wanted = _wanted(model, elements, epsilon)
+    wanted = wanted_elements(model, elements, epsilon)
     clock.lap("scene")
 
     tree = Tree(model.patches, model.materials, model.lights)
@@ -123,7 +123,7 @@ def _check(oracle, elements, epsilon, rays, lines):
         raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
 
 
-def _wanted(model, elements, epsilon):
+def wanted_elements(model, elements, epsilon):
     """Leaves to refine to, or None where ε decides."""
     count = model.patches.count
     if epsilon is not None:
