@@ -295,11 +295,11 @@ def test_powers_at_the_ends(value, power):
 @pytest.mark.parametrize("kind, dtype", [("Float", np.float32), ("UInt32", np.uint32)])
 @pytest.mark.parametrize("n", [0, 1, 5, 1000])
 def test_owned_is_a_copy(kind, dtype, n):
-    """What happens to NumPy's memory afterwards does not show, whatever was given and however it lies there."""
-    for given in (np.arange(n), np.arange(2 * n)[::2] // 2, np.arange(n, dtype=dtype), np.arange(n, dtype=float)):
-        expected = given.astype(dtype)
-        copy = owned(getattr(mi, kind), given)
-        given[:] = 7
+    """What happens to NumPy's memory afterwards does not show, whatever was array and however it lies there."""
+    for array in (np.arange(n), np.arange(2 * n)[::2] // 2, np.arange(n, dtype=dtype), np.arange(n, dtype=float)):
+        expected = array.astype(dtype)
+        copy = owned(getattr(mi, kind), array)
+        array[:] = 7
         assert type(copy) is getattr(mi, kind) and dr.width(copy) == n
         np.testing.assert_array_equal(np.array(copy), expected)
 
@@ -336,7 +336,7 @@ def test_probabilities_are_those_of_the_weights(values):
 @EXAMPLES
 @given(weights(), st.integers(0, 2**32 - 1))
 def test_positions_belong_to_the_number_that_covers_them(values, seed):
-    """Each number owns [start, start + weight): its first and its last position are its own, and all others' are not."""
+    """Each number has [start, start + weight), from its first to its last position, and nothing else."""
     d, k = Distribution(mi.Float64(values), values.sum()), dr.arange(mi.UInt32, len(values))
     weight, start = np.array(d.weight), np.array(d.start(k))
     assert weight.sum() == d.whole and (start == np.cumsum(weight) - weight).all()

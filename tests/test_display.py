@@ -142,7 +142,8 @@ def box(low, high, rho, **parts):
 @pytest.mark.parametrize("elements", [200, 1500])
 def test_legs_that_end_in_solids_are_lit(elements):
     """Legs of a table that go through its top and the floor, so that all corners of their elements are inside of
-    something: as bright in Gouraud shading as in flat, to 2 %, which is what `path` shows, to 30 % on so few elements."""
+    something: as bright in Gouraud shading as in flat, to 2 %, which is what `path` shows, to 30 % on so few
+    elements."""
     T = mi.ScalarTransform4f
     feet = [(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
     room = mi.load_dict(

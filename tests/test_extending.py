@@ -151,8 +151,8 @@ def point_light():
     class Point(mr.Light):
         emitters = ("PointLight",)
 
-        def __init__(self, emitter, centre, radius):
-            super().__init__(emitter, centre, radius)
+        def __init__(self, emitter, scene, low, high):
+            super().__init__(emitter, scene, low, high)
             parameters = mi.traverse(emitter)
             self.position, self.intensity = (
                 kind(parameters[name]) for kind, name in ((mi.Point3f, "position"), (mi.Color3f, "intensity.value"))
@@ -176,7 +176,8 @@ def point(position, intensity=(1.0, 2.0, 3.0)):
     return {"type": "point", "position": position, "intensity": {"type": "rgb", "value": list(intensity)}}
 
 
-def test_point_lights_are_refused_until_they_are_known():
+def test_lamps_are_refused_until_they_are_known():
+    del LIGHTS["PointLight"]
     with pytest.raises(mr.RadiosityError, match="PointLight"):
         mr.solve(scene(box={"type": "cube", "flip_normals": True}, lamp=point([0, 0, 0])), **BUDGET)
 
@@ -248,20 +249,22 @@ def test_a_lamp_that_moves_is_noticed(point_light):
 
 
 def test_a_mesher_for_a_shape():
-    """Spheres are refused before, and solved afterwards, as the mesh it makes: here an octahedron."""
+    """Without one spheres are refused, and with one solved, as the mesh it makes: here an octahedron."""
+    del MESHERS["Sphere"]
     parts = scene(
         optimize=False,
         ball={"type": "sphere", "radius": 0.5, "center": [0, 0, 1], "bsdf": diffuse(0.3), "emitter": lamp(2)},
         floor=rectangle(bsdf=diffuse(0.5)),
     )
-    assert "only meshes" in inspect(parts)[0].why
+    assert "are not modelled: export it as a mesh" in inspect(parts)[0].why
 
     @mr.mesher("Sphere")
-    def octahedron(sphere):
+    def octahedron(sphere, share):
+        assert 0 < share < 1
         box = sphere.bbox()
         points = np.array(box.center()) + box.extents().x / 2 * np.vstack([np.eye(3), -np.eye(3)])
         faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
-        return build_mesh(sphere, points, faces)
+        return build_mesh(sphere, points, np.array(faces))
 
     assert not inspect(parts)
     solution = mr.solve(parts, **BUDGET)

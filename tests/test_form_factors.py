@@ -233,7 +233,10 @@ def test_reciprocity():
 
 @pytest.mark.parametrize("oracle", [mr.GMI(0.5), mr.MI(), mr.GMI(1.5)], ids=str)
 def test_nothing_to_refine_inside_a_sphere(oracle):
-    """F is constant in a sphere, but for facets that touch: where a box of its area is split again and again, fewer than 1 % of 1,280 facets are."""
+    """F is constant in a sphere, but for facets that touch.
+
+    Where a box of its area is split again and again, fewer than 1 % of 1,280 facets are.
+    """
     vertices, faces = icosphere(3)
     ball = scene(ball=mesh(vertices, faces, diffuse(A), lamp()))
     side = (4 * np.pi / 6) ** 0.5

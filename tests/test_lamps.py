@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import balance, diffuse, lamp, rectangle, scene
+from conftest import balance, diffuse, lamp, rectangle
 
 DOWN = mi.ScalarTransform4f().look_at([0.3, 0.2, 1.9], [0, 0, 0], [0, 1, 0])
 TEXTURE = np.random.default_rng(3).uniform(0, 1, (8, 16, 3)).astype(np.float32) ** 4

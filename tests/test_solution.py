@@ -44,7 +44,7 @@ def test_a_frozen_mesh_refuses_writes(tree):
 
 def test_a_growing_tree_names_no_leaves(tree):
     with pytest.raises(AttributeError, match="freeze it first"):
-        tree.leaves
+        _ = tree.leaves
 
 
 def test_later_splits_leave_a_frozen_mesh_alone(tree):
@@ -107,7 +107,7 @@ def barycentric(points, triangle):
 
 
 def test_leaves_lie_in_their_faces_and_fill_them(room, leaves):
-    """Shape, face and vertices belong together: all vertices in the face, areas of the vertices add up to the face's."""
+    """Shape, face and vertices belong together: all vertices lie in the face, and areas add up to the face's."""
     assert len(leaves) == len(leaves.vertices) and 0 <= 500 - len(leaves) < 3
     own = np.linalg.norm(np.cross(*(leaves.vertices[:, k] - leaves.vertices[:, 0] for k in (1, 2))), axis=1) / 2
     np.testing.assert_allclose(own, leaves.area, rtol=1e-3)

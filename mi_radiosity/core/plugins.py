@@ -6,6 +6,7 @@ import importlib.metadata
 import runpy
 import warnings
 from pathlib import Path
+from typing import Any
 
 from .errors import RadiosityError
 
@@ -23,7 +24,7 @@ class Registry(dict):
         """Make a class known; a later one of the same name takes its place."""
         self[name] = cls
 
-    def find(self, name: str) -> type:
+    def find(self, name: str) -> Any:
         """The class of a name. Raises RadiosityError that lists the names there are."""
         if name not in self:
             raise RadiosityError(f"unknown {self.kind} '{name}': choose one of {', '.join(self)}")

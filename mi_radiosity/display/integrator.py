@@ -1,5 +1,7 @@
 """The `radiosity` integrator: any sensor looks at a solution through Mitsuba's own film."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -28,12 +30,12 @@ def _integrator_class():
         The scene is solved at its first picture and not again until it, or a parameter, changes.
         """
 
-        def __init__(self, props):
+        def __init__(self, props: "mi.Properties") -> None:
             super().__init__(props)
             self.shading = props.get("shading", "gouraud")
             SHADERS.find(self.shading)
             alpha = float(props.get("alpha")) if "alpha" in props else None
-            self.options = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
+            self.options: dict[str, Any] = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
             for name, kind in (("elements", int), ("epsilon", float), ("rays", int), ("lines", int), ("seed", int)):
                 if name in props:
                     self.options[name] = kind(props.get(name))
@@ -141,12 +143,14 @@ def _reflectance(model, prelim, ray, hit, lit):
     return dr.select(model.materials.is_traced(face), dr.gather(mi.Color3f, model.patches.reflectance, patch), value)
 
 
-def register(*_) -> None:
+def register(*_: object) -> None:
     """Make `radiosity` known to the active variant, and to those chosen later."""
     if mi.variant():
         mi.register_integrator("radiosity", lambda props: _integrator_class()(props))
 
 
-def render(solution: Solution, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+def render(
+    solution: Solution, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+) -> "mi.TensorXf":
     """Picture of ``solution`` from a sensor (or its number), [height, width, channels]."""
     return solution.render(sensor, spp=spp, shading=shading, seed=seed)

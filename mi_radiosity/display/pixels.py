@@ -1,5 +1,7 @@
 """Camera samples: well spread over pixels, lenses, lamps and directions, and unbiased."""
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
@@ -18,7 +20,7 @@ class PixelPoints:
     pixels: how many; ``count`` samples of each, from number ``first`` of ``total``; ordered by pixel.
     """
 
-    def __init__(self, pixels, first, count, total, seed) -> None:
+    def __init__(self, pixels: int, first: int, count: int, total: int, seed: int) -> None:
         self._count, self._total, self._dimension = count, total, 0
         k = dr.arange(mi.UInt32, pixels * count)
         each = dr.opaque(mi.UInt32, count)
@@ -44,7 +46,9 @@ class PixelPoints:
         return mi.Point2f(mi.radical_inverse_2(index, x), mi.sobol_2(index, y))
 
 
-def picture(scene, sensor, spp, seed, sample, develop=True) -> "mi.TensorXf | None":
+def picture(
+    scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable, develop: bool = True
+) -> "mi.TensorXf | None":
     """The film of a sensor after ``spp`` samples per pixel of ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
     from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
 

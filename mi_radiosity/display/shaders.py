@@ -35,7 +35,7 @@ class Shader:
 
     name = ""
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             SHADERS.add(cls.name, cls)
@@ -62,11 +62,11 @@ class Gouraud(Shader):
 
     name = "gouraud"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self.field = solution.field
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return self.field.at(look.leaf, look.hit.u, look.hit.v, look.lit)
 
 
@@ -75,11 +75,11 @@ class Flat(Shader):
 
     name = "flat"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._irradiance = solution.irradiance()
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return dr.gather(mi.Color3f, self._irradiance, look.leaf, look.lit)
 
 
@@ -88,7 +88,7 @@ class Mesh(Gouraud):
 
     name = "mesh"
 
-    def radiance(self, look):
+    def radiance(self, look: Look) -> "mi.Color3f":
         return super().radiance(look) * dr.select(self._on_outline(look), LINE_SHADE, 1)
 
     def _on_outline(self, look):
@@ -119,11 +119,11 @@ class Gather(Shader):
 
     name = "gather"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._gatherer = solution.gatherer()
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         lamps, room = self._samples(look)
         return lamps + room
 
@@ -155,9 +155,9 @@ class Direct(Gather):
 
     name = "direct"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._field = Field(solution, solution.indirect)
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return self._samples(look)[0] + self._field.at(look.leaf, look.hit.u, look.hit.v, look.lit)

@@ -1,4 +1,4 @@
-"""A solution taken home: measured, as a mesh for other programs, as a scene that shines by itself, as a page to walk in."""
+"""A solution taken home: measured, as a mesh for other programs, a scene that shines by itself, a page to walk in."""
 
 from .api import WRITERS, export
 from .geometry import LitMesh, lit_mesh

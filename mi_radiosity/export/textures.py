@@ -10,7 +10,7 @@ from ..scene.tessellate import Part
 from .geometry import LitMesh
 from .tone import srgb8
 
-PLAIN, MOST = 512, 2048  # pixels along a side: of a texture that is no bitmap, and at most
+FEWEST, MOST = 512, 2048  # pixels along a side
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,7 @@ def _bake(bsdf, back, low, high):
 
 
 def _resolution(bsdf, span):
-    """Width and height in pixels: those of the largest bitmap in a BSDF, as often as it is repeated."""
-    size = np.array([PLAIN, PLAIN])
+    """Width and height in pixels: at least those of the largest bitmap in a BSDF, as often as it is repeated."""
     bitmaps = [value.shape for name, value in mi.traverse(bsdf) if name.endswith("data") and dr.is_tensor_v(value)]
-    if bitmaps:
-        size = np.max(bitmaps, axis=0)[1::-1]
-    return tuple(int(n) for n in np.clip(np.ceil(size * span), 4, MOST))
+    size = np.max(bitmaps, axis=0)[1::-1] if bitmaps else np.array([FEWEST, FEWEST])
+    return tuple(int(n) for n in np.clip(np.ceil(size * span), FEWEST, MOST))

@@ -7,6 +7,8 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.lights import Lights
+from ..scene.materials import Materials
 from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
 
@@ -39,53 +41,59 @@ class Elements:
     reflectance: "mi.Color3f"
     exitance: "mi.Color3f | None"
 
-    def __init__(self, patches, arrays, exitance=None):
+    def __init__(
+        self, patches: Patches, arrays: "dict[str, dr.ArrayBase]", exitance: "mi.Color3f | None" = None
+    ) -> None:
         vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return dr.width(self.patch)
 
-    def __setattr__(self, name, value):
+    def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
 
     @cached_property
-    def leaves(self):
+    def leaves(self) -> "mi.UInt32":
         """Numbers of the leaves (UInt32 [leaves]), neighbours after neighbours, whichever was split first."""
         leaves = dr.compress(self.child == 0)
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
 
-    def level(self, element):
+    def level(self, element: "mi.UInt32") -> "mi.UInt32":
         """How often the patch was split (UInt32 [n])."""
         return dr.gather(mi.UInt32, self.place, element) & 15
 
-    def key(self, element):
+    def key(self, element: "mi.UInt32") -> "mi.UInt32":
         """What random numbers of elements are drawn by: the same whatever else was split (UInt32 [n])."""
         return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
-    def emission(self, element):
+    def emission(self, element: "mi.UInt32") -> "mi.Color3f":
         """E, the mean over elements (Color3f [n])."""
         if self.exitance is not None:
             return dr.gather(mi.Color3f, self.exitance, element)
         return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
-    def patch_point(self, element, a, b):
+    def patch_point(self, element: "mi.UInt32", a: "mi.Float", b: "mi.Float") -> "tuple[mi.Float, mi.Float]":
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
         scale = dr.gather(mi.Float, self.scale, element)
         return dr.gather(mi.Float, self.u0, element) + scale * a, dr.gather(mi.Float, self.v0, element) + scale * b
 
-    def own_point(self, element, u, v, active=True):
+    def own_point(
+        self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Float, mi.Float]":
         """The element's own coordinates (a, b) of the patch point (u, v)."""
         scale = dr.select(active, dr.gather(mi.Float, self.scale, element, active), 1)
         a = (u - dr.gather(mi.Float, self.u0, element, active)) / scale
         return a, (v - dr.gather(mi.Float, self.v0, element, active)) / scale
 
-    def locate(self, element, u, v):
+    def locate(self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.UInt32":
         """Child number 0…3 of ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         return child_at(*self.own_point(element, u, v))
 
     @dr.syntax
-    def leaf_at(self, element, u, v, active=True):
+    def leaf_at(
+        self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.UInt32":
         """The leaf below ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         element = mi.UInt32(element)
         child = dr.gather(mi.UInt32, self.child, element, active)
@@ -98,9 +106,9 @@ class Elements:
 class Tree(Elements):
     """Elements that still split. ``leaf_count`` is the number of leaves."""
 
-    __setattr__ = object.__setattr__
+    __setattr__ = object.__setattr__  # type: ignore[assignment]
 
-    def __init__(self, patches, materials, lights):
+    def __init__(self, patches: Patches, materials: Materials, lights: Lights) -> None:
         n = patches.count
         every = dr.arange(mi.UInt32, n)
         zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
@@ -111,7 +119,7 @@ class Tree(Elements):
             self.exitance = mi.Color3f(patches.emission)
 
     @property
-    def leaves(self):
+    def leaves(self) -> "mi.UInt32":
         raise AttributeError("a tree still grows: freeze it first")
 
     def freeze(self) -> Elements:
@@ -122,7 +130,7 @@ class Tree(Elements):
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
 
-    def split(self, chosen):
+    def split(self, chosen: "mi.UInt32") -> None:
         """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
         count = dr.width(chosen)
         if count == 0:
@@ -170,7 +178,9 @@ class Tree(Elements):
         )
 
 
-def mean_exitance(patches, lights, patch, u0, v0, scale):
+def mean_exitance(
+    patches: Patches, lights: Lights, patch: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
+) -> "mi.Color3f":
     """E averaged over triangles (u0 + scale a, v0 + scale b) of patches (Color3f [n])."""
     exitance = dr.zeros(mi.Color3f, dr.width(patch))
     shining = dr.compress(dr.max(dr.gather(mi.Color3f, patches.emission, patch)) > 0)

@@ -3,6 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.arrays import owned
 from ..core.errors import RadiosityError
@@ -23,8 +24,9 @@ class Faces:
     Raises RadiosityError for what cannot be read, naming the shape.
     """
 
-    def __init__(self, scene):
-        self.scene, self.warnings = scene, []
+    def __init__(self, scene: "mi.Scene") -> None:
+        self.scene = scene
+        self.warnings: list[str] = []
         if not scene.shapes():
             raise RadiosityError("the scene has no shapes: nothing can be lit")
         self.tracing, self.parts = tracing_scene(scene)
@@ -32,7 +34,7 @@ class Faces:
         self._read(*_corners(self.tracing))
         self._orient()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.shape)
 
     def _read(self, corners, counts):
@@ -67,7 +69,7 @@ class Faces:
         self.flipped = (shading * self.normal).sum(axis=1) < 0
         self.normal[self.flipped] *= -1
 
-    def surface(self, face, u, v):
+    def surface(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.SurfaceInteraction3f":
         """Mitsuba's surface interaction at points (u, v) of faces (UInt32, Float, Float [n])."""
         n = dr.width(face)
         prelim = dr.zeros(mi.PreliminaryIntersection3f, n)
@@ -81,16 +83,16 @@ class Faces:
 
     # ---- What messages call them ---------------------------------------------------------------
 
-    def refuse(self, bad, why):
+    def refuse(self, bad: ArrayLike, why: str) -> None:
         """Raise RadiosityError naming the shape of the first face in ``bad`` (bool [faces])."""
-        if bad.any():
+        if np.any(bad):
             raise RadiosityError(f"{self.name(self.shape[np.argmax(bad)])} {why}")
 
-    def name(self, shape):
+    def name(self, shape: int) -> str:
         """How messages call the shape of a number."""
         return self.parts[shape].name
 
-    def names(self, which):
+    def names(self, which: np.ndarray) -> str:
         """The shapes of faces (a mask or numbers), three of them by name."""
         names = sorted({self.name(i) for i in np.unique(self.shape[which])})
         return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

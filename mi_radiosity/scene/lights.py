@@ -1,5 +1,8 @@
 """Lamps: one class per kind, and all lamps of a scene behind one face."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -8,6 +11,7 @@ from ..core.arrays import opaque_index, owned, totals
 from ..core.errors import RadiosityError
 from ..core.plugins import Registry
 from ..core.points import kronecker, triangle
+from .faces import Faces
 
 LIGHTS = Registry("emitter")
 LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
@@ -26,33 +30,35 @@ class Light:
     emitters: tuple[str, ...] = ()
     on_surface = False
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         for name in vars(cls).get("emitters", ()):
             LIGHTS.add(name, cls)
 
-    def __init__(self, emitter, scene, low, high):
+    def __init__(self, emitter: "mi.Emitter", scene: "mi.Scene", low: np.ndarray, high: np.ndarray) -> None:
         self.emitter, self.scene, self.low, self.high = emitter, scene, low, high
 
     @staticmethod
-    def refusal(emitter) -> str | None:
+    def refusal(emitter: "mi.Emitter") -> str | None:
         """Why an emitter of this kind cannot be used, and what to do, or None."""
 
     @staticmethod
-    def exitance(emitter, si):
+    def exitance(emitter: "mi.EmitterPtr", si: "mi.SurfaceInteraction3f") -> "mi.Color3f":
         """E = π L_e of emitters at points of their shapes, W/m² (EmitterPtr, SurfaceInteraction3f ─► Color3f [n])."""
         raise NotImplementedError
 
-    def power(self):
+    def power(self) -> Sequence[float]:
         """What `shoot` sends into the scene, W (three floats)."""
         raise NotImplementedError
 
-    def shoot(self, x, y, s, t):
+    def shoot(
+        self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
+    ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
         """Rays from four uniform numbers each (Float [n]): origin, unit direction, and the power each would
         carry were it the only one, whose mean is `power` (Point3f, Vector3f, Color3f [n])."""
         raise NotImplementedError
 
-    def sample(self, point, s, t):
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
         """Towards the lamp from points, with two uniform numbers each: unit direction, distance, and the irradiance
         of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
@@ -65,21 +71,30 @@ class Light:
             parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
         return b"".join(parts)
 
-    def density(self, direction):
-        """Density of `sample` over directions, 1/sr, where rays that leave the scene see the lamp; else 0 (Float [n])."""
+    def density(self, direction: "mi.Vector3f") -> "mi.Float":
+        """Density of `sample` over directions, 1/sr, if rays that leave the scene see the lamp; else 0 (Float [n])."""
         return mi.Float(0)
 
-    def share_of_rays(self, direction, cosine, rays_per_line):
-        """The balance heuristic's weight of cosine-distributed rays, of which there are so many per `sample` (None: there
-        are no samples), that see the lamp (Float [n])."""
+    def share_of_rays(self, direction: "mi.Vector3f", cosine: "mi.Float", rays_per_line: "float | None") -> "mi.Float":
+        """The balance heuristic's weight of cosine-distributed rays that see the lamp, of which there are so many per
+        `sample` (None: there are no samples) (Float [n])."""
         if rays_per_line is None:
             return mi.Float(1)
         density, of_rays = self.density(direction), rays_per_line * dr.maximum(cosine, 0) * dr.inv_pi
         return dr.select(density > 0, of_rays / (density + of_rays), 0)
 
-    def lights_up(self, rays, x, normal, s, t, active=True, rays_per_line=0.0):
-        """H at points x, relative to the patches' origin, with their normals: one `sample` each (Color3f [n]), weighed
-        against the rays that see the lamp."""
+    def lights_up(
+        self,
+        rays: Any,
+        x: "mi.Point3f",
+        normal: "mi.Vector3f",
+        s: "mi.Float",
+        t: "mi.Float",
+        active: "mi.Bool | bool" = True,
+        rays_per_line: float = 0.0,
+    ) -> "mi.Color3f":
+        """H at points x, relative to the patches' origin, with their normals: one `sample` each, weighed against the
+        rays that see the lamp (Color3f [n])."""
         direction, distance, irradiance = self.sample(x + rays.patches.origin, s, t)
         cosine = dr.dot(direction, normal)
         lit = active & (cosine > 0) & (dr.max(irradiance) > 0)
@@ -96,7 +111,7 @@ class Area(Light):
     on_surface = True
 
     @staticmethod
-    def exitance(emitter, si):
+    def exitance(emitter: "mi.EmitterPtr", si: "mi.SurfaceInteraction3f") -> "mi.Color3f":
         si.wi = mi.Vector3f(0, 0, 1)
         return dr.pi * mi.Color3f(emitter.eval(si))
 
@@ -106,16 +121,16 @@ class Free(Light):
 
     emitters: tuple[str, ...] = ("PointLight", "SpotLight", "Projector")
 
-    def __init__(self, emitter, scene, low, high):
+    def __init__(self, emitter: "mi.Emitter", scene: "mi.Scene", low: np.ndarray, high: np.ndarray) -> None:
         super().__init__(emitter, scene, low, high)
         number = dr.arange(mi.UInt32, SAMPLES)
         weight = self.shoot(*kronecker(number, opaque_index(0), opaque_index(0)))[2]
         self._power = [total / SAMPLES for total in totals([mi.Float64(w) for w in weight])]
 
-    def power(self):
+    def power(self) -> Sequence[float]:
         return self._power
 
-    def fingerprint(self):
+    def fingerprint(self) -> bytes:
         """Power and a few rays, to three digits: not all parameters are shown to Python."""
         number = dr.arange(mi.UInt32, 16)
         origin, direction, weight = self.shoot(*kronecker(number, opaque_index(0), opaque_index(0)))
@@ -125,12 +140,14 @@ class Free(Light):
         power = [float(f"{p:.3g}") for p in self._power]
         return (np.concatenate([power, np.round(np.column_stack(rows).ravel(), 2)]) + 0.0).tobytes()
 
-    def shoot(self, x, y, s, t):
+    def shoot(
+        self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
+    ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
         ray, weight = self.emitter.sample_ray(0.0, 0.0, mi.Point2f(x, y), mi.Point2f(s, t))
         n = dr.width(x)
         return ray.o + dr.zeros(mi.Point3f, n), ray.d + dr.zeros(mi.Vector3f, n), _sound(weight, n)
 
-    def sample(self, point, s, t):
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
         it = dr.zeros(mi.SurfaceInteraction3f, dr.width(point))
         it.p = point
         sample, weight = self.emitter.sample_direction(it, mi.Point2f(s, t))
@@ -153,14 +170,16 @@ class Infinite(Free):
         "TimedSunskyEmitter",
     )
 
-    def density(self, direction):
+    def density(self, direction: "mi.Vector3f") -> "mi.Float":
         if not self.emitter.is_environment():
             return mi.Float(0)
         sample = dr.zeros(mi.DirectionSample3f, dr.width(direction))
         sample.d = direction
         return self.emitter.pdf_direction(dr.zeros(mi.Interaction3f), sample)
 
-    def shoot(self, x, y, s, t):
+    def shoot(
+        self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
+    ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
         low, high = (mi.Vector3f(*(dr.opaque(mi.Float, c) for c in corner)) for corner in (self.low, self.high))
         size = high - low
         centre = mi.Point3f(low + 0.5 * size) + dr.zeros(mi.Point3f, dr.width(x))
@@ -187,17 +206,17 @@ class DirectionalArea(Free):
     emitters = ("DirectionalArea",)
 
     @staticmethod
-    def refusal(emitter):
+    def refusal(emitter: "mi.Emitter") -> str | None:
         normal = _normals(emitter.get_shape())
         if dr.all(dr.dot(normal, dr.gather(mi.Vector3f, normal, 0)) > 1 - 1e-5):
             return None
         return "its emitter 'directionalarea' is on a curved shape: put it on a flat one, or use 'area'"
 
-    def __init__(self, emitter, scene, low, high):
+    def __init__(self, emitter: "mi.Emitter", scene: "mi.Scene", low: np.ndarray, high: np.ndarray) -> None:
         self._normal = mi.Vector3f(*(dr.mean(c) for c in _normals(emitter.get_shape())))
         super().__init__(emitter, scene, low, high)
 
-    def sample(self, point, s, t):
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
         n, pad = dr.width(point), dr.opaque(mi.Float, 2.0**-14 * np.linalg.norm(self.high - self.low))
         towards = -self._normal + dr.zeros(mi.Vector3f, n)
         si = self.scene.ray_intersect(mi.Ray3f(point + towards * pad, towards))
@@ -213,7 +232,7 @@ class Lights:
     Raises RadiosityError if there is no light, or if a lamp's is impossible, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self._faces = faces
         emitters = [part.shape.emitter() for part in faces.parts]
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
@@ -252,7 +271,9 @@ class Lights:
 
     # ---- Light at points and in directions -----------------------------------------------------
 
-    def exitance_at(self, face, u, v, active=True):
+    def exitance_at(
+        self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.Color3f":
         """E at points of the fronts of faces (Color3f [n])."""
         total = mi.Color3f(0)
         if self._kinds:
@@ -262,7 +283,7 @@ class Lights:
                 total += dr.select(active & (which == number), kind.exitance(emitter, si), 0)
         return total
 
-    def mean_exitance(self, face, u0, v0, scale):
+    def mean_exitance(self, face: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float") -> "mi.Color3f":
         """E averaged over triangles (u0 + scale a, v0 + scale b) of faces' fronts (Color3f [n])."""
         points, step = LATTICE if self.textured else (1, 0)
         each, k = opaque_index(points), dr.arange(mi.UInt32, dr.width(face) * points)
@@ -272,7 +293,9 @@ class Lights:
         values = self.exitance_at(face, u0 + scale * a, v0 + scale * b)
         return mi.Color3f(*(dr.block_sum(x + dr.zeros(mi.Float, dr.width(k)), points) / mi.Float(each) for x in values))
 
-    def at(self, patches, patch, u, v, active=True):
+    def at(
+        self, patches: Any, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.Color3f":
         """E at points of patches (Color3f [n])."""
         mean = dr.gather(mi.Color3f, patches.emission, patch, active)
         if not self.textured:
@@ -280,7 +303,7 @@ class Lights:
         shines = active & (dr.max(mean) > 0)
         return self.exitance_at(dr.gather(mi.UInt32, patches.face, patch, shines), u, v, shines)
 
-    def sky(self, direction, active=True):
+    def sky(self, direction: "mi.Vector3f", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """E = π L of what rays see that leave the scene in a direction (Vector3f ─► Color3f [n])."""
         if self.sky_light is None:
             return mi.Color3f(0)
@@ -289,12 +312,12 @@ class Lights:
         return dr.pi * dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
 
     @property
-    def sky_light(self):
+    def sky_light(self) -> Light | None:
         """The lamp that rays see which leave the scene, or None."""
         return next((light for light in self.free if light.emitter.is_environment()), None)
 
 
-def varies(emitter) -> bool:
+def varies(emitter: "mi.Emitter") -> bool:
     """Is the radiance of an emitter textured?"""
     return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 

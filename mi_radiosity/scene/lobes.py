@@ -1,6 +1,7 @@
 """Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -40,7 +41,16 @@ class Trail:
 class Lobes:
     """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
 
-    def follow(self, rays, ray, number, seed, mode, camera, active=True):
+    def follow(
+        self,
+        rays: Any,
+        ray: "mi.Ray3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        mode: "mi.TransportMode",
+        camera: bool,
+        active: "mi.Bool | bool" = True,
+    ) -> Trail:
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
 
         mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.

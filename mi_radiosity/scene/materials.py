@@ -1,5 +1,6 @@
 """Reflectances of the faces, and what of a Mitsuba scene is modelled at all."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,12 +10,14 @@ import numpy as np
 from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
+from .faces import Faces
 from .lights import LIGHTS
-from .tessellate import UNMESHED, children, parts
+from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
+WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
 AT_ONCE = 1 << 22  # samples in one launch
@@ -27,7 +30,7 @@ class Materials:
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self._faces = faces
         shapes = faces.tracing.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
@@ -43,9 +46,14 @@ class Materials:
         self._find_albedos(textured)
         faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
-            (self.rho >= 1).any(axis=(0, 2)),
-            "has a reflectance of 1 or more, which conserves no energy: make it less than 1",
+            (self.rho > 1 + ROUNDING).any(axis=(0, 2)),
+            "has a reflectance of more than 1, which makes energy from nothing: make it less than 1",
         )
+        white = self.rho > WHITEST
+        if white.any():
+            where = faces.names(white.any(axis=(0, 2)))
+            faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
+            self.rho = np.minimum(self.rho, WHITEST)
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
     def _mean(self, faces, points):
@@ -60,7 +68,7 @@ class Materials:
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
 
-    def is_traced(self, face, active=True):
+    def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Do faces have lobes that are traced (Bool [n])?"""
         if not self.traced.any():
             return mi.Bool(False)
@@ -83,7 +91,7 @@ class Materials:
                         side[part] = rho
 
     def _albedo(self, faces, samples):
-        """E[w; diffuse] of the BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+        """E[w; diffuse] of BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
@@ -99,7 +107,7 @@ class Materials:
             rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
         return np.array(rho)
 
-    def reflectance_at(self, face, u, v, back):
+    def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
         si = self._faces.surface(face, u, v)
         si.wi = mi.Vector3f(0, 0, dr.select(back, -1.0, 1.0))
@@ -117,7 +125,7 @@ class Finding:
     why: str  # what is wrong and what to do
 
 
-def is_diffuse(bsdf) -> bool:
+def is_diffuse(bsdf: "mi.BSDF") -> bool:
     """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
     if kind in NESTING:
@@ -125,7 +133,7 @@ def is_diffuse(bsdf) -> bool:
     return kind in DIFFUSE
 
 
-def is_textured(bsdf) -> bool:
+def is_textured(bsdf: "mi.BSDF") -> bool:
     """Does the reflectance of ``bsdf`` vary over a surface?"""
     return any(
         is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in children(bsdf)
@@ -142,7 +150,7 @@ def _inspect_shape(shape):
         yield "shapes of this kind are not modelled: export it as a mesh"
 
 
-def inspect_part(part):
+def inspect_part(part: Part) -> Iterator[str]:
     """What is wrong with a part of a scene."""
     shape = part.shape
     if not part.can_mesh:
@@ -154,7 +162,7 @@ def inspect_part(part):
         yield "its emitter is in a medium, and those are not modelled: remove the medium"
 
 
-def inspect_emitter(emitter):
+def inspect_emitter(emitter: "mi.Emitter") -> Iterator[str]:
     """What is wrong with an emitter."""
     if emitter.class_name() not in LIGHTS:
         yield f"emitters of this kind are not modelled: use one of {', '.join(LIGHTS)}"
@@ -162,7 +170,7 @@ def inspect_emitter(emitter):
         yield refusal
 
 
-def inspect(scene) -> list[Finding]:
+def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
     for part in parts(scene):
@@ -173,7 +181,7 @@ def inspect(scene) -> list[Finding]:
     return findings
 
 
-def require_supported(scene) -> None:
+def require_supported(scene: "mi.Scene") -> None:
     """Raise RadiosityError, naming the first part of ``scene`` that is not modelled."""
     findings = inspect(scene)
     if findings:

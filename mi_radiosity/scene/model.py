@@ -2,6 +2,7 @@
 
 import hashlib
 
+import mitsuba as mi
 import numpy as np
 
 from ..core.llvm import require_variant
@@ -25,7 +26,7 @@ class Model:
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
 
-    def __init__(self, scene, sides: np.ndarray | None = None):
+    def __init__(self, scene: "mi.Scene", sides: np.ndarray | None = None) -> None:
         require_variant()
         require_supported(scene)
         self.scene, self.state = scene, State(scene)
@@ -44,7 +45,7 @@ class Model:
         self.patches = self.rays.patches
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
-    def with_sides(self, sides) -> "Model":
+    def with_sides(self, sides: np.ndarray) -> "Model":
         """The same scene with other patches."""
         return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides)
 

@@ -2,14 +2,18 @@
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.arrays import opaque_index, owned_vectors
+from .faces import Faces
 
 REACH = 0.01  # of the diagonal of the scene, beyond which a point has no surface
 TILT = 4.0  # times the lift: how much nearer a face counts that a normal belongs to
 
 
-def nearest_face(faces, points, normals, lift):
+def nearest_face(
+    faces: Faces, points: np.ndarray, normals: np.ndarray, lift: float
+) -> "tuple[mi.UInt32, mi.Float, mi.Float, mi.Bool]":
     """The face nearest to points and where on it (UInt32, Float u, Float v), and whether it is within REACH (Bool [n]).
 
     points, normals: float64 [n, 3]. At edges the face counts whose normal is most like the given one or its opposite.

@@ -12,11 +12,11 @@ class State:
     Keeps Dr.Jit's variables, so that a comparison costs no look at their contents unless they were replaced.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: "mi.Scene") -> None:
         self._shapes = [shape.ptr for shape in scene.shapes()]
         self._parameters = _parameters(scene)
 
-    def same_as(self, scene) -> bool:
+    def same_as(self, scene: "mi.Scene") -> bool:
         """Is ``scene`` as it was?"""
         if self._shapes != [shape.ptr for shape in scene.shapes()]:
             return False
@@ -26,7 +26,7 @@ class State:
         )
 
 
-def refuse_gradients(scene) -> None:
+def refuse_gradients(scene: "mi.Scene") -> None:
     """Raise RadiosityError if a parameter of the scene asks for gradients: a solution has none."""
     with dr.resume_grad():  # mi.render suspends them around an integrator
         for (_, name), value in _parameters(scene).items():

@@ -56,12 +56,12 @@ class Part:
         return kind in MESHERS or (isinstance(self.shape, mi.Mesh) and kind not in UNMESHED)
 
 
-def label(shape, index) -> str:
+def label(shape: "mi.Shape", index: int) -> str:
     """How a shape is called in messages: its id, or its place in the scene."""
     return f"shape '{shape.id()}'" if shape.id() else f"shape {index}"
 
 
-def parts(scene) -> list[Part]:
+def parts(scene: "mi.Scene") -> list[Part]:
     """The shapes of a scene; instances come apart into the members of their group. Those whose group cannot be found
     stay whole."""
     groups, found = None, []
@@ -85,7 +85,7 @@ def parts(scene) -> list[Part]:
     return found
 
 
-def children(thing) -> list:
+def children(thing: "mi.Object") -> list:
     """The Mitsuba objects that ``thing`` is made of."""
 
     class Collect(mi.TraversalCallback):
@@ -100,7 +100,7 @@ def children(thing) -> list:
     return list(callback.found)
 
 
-def tracing_scene(scene):
+def tracing_scene(scene: "mi.Scene") -> "tuple[mi.Scene, list[Part]]":
     """The scene itself, or one in which every shape is a mesh, and its parts in Mitsuba's order."""
     found = parts(scene)
     if all(part.to_world is None and isinstance(part.shape, mi.Mesh) for part in found):
@@ -115,7 +115,7 @@ def tracing_scene(scene):
     return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()]
 
 
-def as_mesh(part, scene_size):
+def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":
     """The mesh of a part where it stands: its shape, if that is one."""
     shape = part.shape
     if not isinstance(shape, mi.Mesh):
@@ -130,7 +130,14 @@ def as_mesh(part, scene_size):
 # ---- Making meshes ---------------------------------------------------------------------------------
 
 
-def build_mesh(shape, vertices, faces, normals=None, uv=None, flipped=False):
+def build_mesh(
+    shape: "mi.Shape",
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    flipped: bool = False,
+) -> "mi.Mesh":
     """An ``mi.Mesh`` from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``; with normals [n, 3] and texture
     coordinates [n, 2] of the vertices, where they are given. ``flipped``: its front is where the normals point away."""
     properties = mi.Properties()
@@ -155,7 +162,7 @@ def _flat(kind, array):
     return kind(np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32).ravel())
 
 
-def placed(mesh, to_world):
+def placed(mesh: "mi.Mesh", to_world: np.ndarray) -> "mi.Mesh":
     """A copy of a mesh under a transform [4, 4]."""
 
     def rows(array, width):
@@ -191,7 +198,7 @@ def _unit(vectors):
 # ---- Meshers ---------------------------------------------------------------------------------------
 
 
-def segments(share) -> int:
+def segments(share: float) -> int:
     """Segments around a round shape, a multiple of 4: few, yet a silhouette misses by no more than OUTLINE of the size
     of the scene, half a pixel where a picture of all of it has 1000."""
     wanted = np.pi * np.sqrt(share / (4 * OUTLINE) / 2)  # r (1 − cos(π/n)), half of it inwards and half outwards
@@ -213,18 +220,18 @@ def _standing(shape, vertices, faces, uv, normals=None):
 
 
 @mesher("Disk")
-def disk_mesh(disk, share):
+def disk_mesh(disk: "mi.Shape", share: float) -> "mi.Mesh":
     """Rings of triangles with exactly the area of ``disk``; every ring has twice the segments of the one inside it."""
     n, radius = segments(share), 1.0
     stretch = np.sqrt(np.pi / (n / 2 * np.sin(2 * np.pi / n)))
-    uv, faces, first = [], [], 0
+    rings, wedges, first = [], [], 0
     while True:
         k = np.arange(n + 1)
-        uv.append(np.column_stack([np.full(n + 1, radius), k / n]))
+        rings.append(np.column_stack([np.full(n + 1, radius), k / n]))
         k, inner = k[:-1], first + n + 1
         if n % 2 or n <= 8:
-            uv.append(np.column_stack([np.zeros(n), (k + 0.5) / n]))  # the centre, once per segment for the textures
-            faces.append(np.column_stack([inner + k, first + k, first + k + 1]))
+            rings.append(np.column_stack([np.zeros(n), (k + 0.5) / n]))  # the centre, once per segment for the textures
+            wedges.append(np.column_stack([inner + k, first + k, first + k + 1]))
             break
         n, radius = n // 2, radius / 2
         k = np.arange(n)
@@ -234,15 +241,15 @@ def disk_mesh(disk, share):
             (inner + k, outer + 1, inner + k + 1),
             (inner + k + 1, outer + 1, outer + 2),
         ):
-            faces.append(np.column_stack(triangle))
+            wedges.append(np.column_stack(triangle))
         first = inner
-    uv, faces = np.vstack(uv), np.vstack(faces)
+    uv, faces = np.vstack(rings), np.vstack(wedges)
     vertices = stretch * uv[:, :1] * _circle(uv[:, 1])
     return _standing(disk, np.column_stack([vertices, np.zeros(len(uv))]), faces, uv)
 
 
 @mesher("Cylinder")
-def cylinder_mesh(cylinder, share):
+def cylinder_mesh(cylinder: "mi.Shape", share: float) -> "mi.Mesh":
     """A prism with exactly the area of ``cylinder`` (if it is round), and the cylinder's normals."""
     matrix = np.array(mi.traverse(cylinder)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
     n, (radius, _, length) = segments(share), np.linalg.norm(matrix[:3, :3], axis=0)
@@ -258,7 +265,7 @@ def cylinder_mesh(cylinder, share):
 
 
 @mesher("Sphere")
-def sphere_mesh(sphere, share):
+def sphere_mesh(sphere: "mi.Shape", share: float) -> "mi.Mesh":
     """Eight octants of equal triangles with exactly the area of ``sphere``, and its normals."""
     n = segments(share) // 4
     j, i = (x[np.tril_indices(n + 1)] for x in np.indices((n + 1, n + 1)))  # from the pole down, and around
@@ -268,13 +275,14 @@ def sphere_mesh(sphere, share):
     below = k < rows
     down = np.column_stack([at(rows, k), at(rows + 1, k + 1), at(rows, k + 1)])[below]
     octant, count = np.vstack([up, down]), len(j)
-    uv, faces = [], []
+    grids: list[np.ndarray] = []
+    octants: list[np.ndarray] = []
     for quarter in range(4):
         around = np.where(j > 0, (quarter + i / np.maximum(j, 1)) / 4, (quarter + 0.5) / 4)
         for south in (False, True):
-            faces.append((octant[:, ::-1] if south else octant) + len(uv) * count)
-            uv.append(np.column_stack([around, (1 - j / (2 * n)) if south else j / (2 * n)]))
-    uv, faces = np.vstack(uv), np.vstack(faces)
+            octants.append((octant[:, ::-1] if south else octant) + len(grids) * count)
+            grids.append(np.column_stack([around, (1 - j / (2 * n)) if south else j / (2 * n)]))
+    uv, faces = np.vstack(grids), np.vstack(octants)
     height = np.where(uv[:, 1] == 0.5, 0, np.cos(np.pi * uv[:, 1]))
     across = np.where(np.isin(uv[:, 1], (0, 1)), 0, np.sin(np.pi * np.minimum(uv[:, 1], 1 - uv[:, 1])))
     normals = np.column_stack([across[:, None] * _circle(uv[:, 0]), height])

@@ -8,8 +8,9 @@ import mitsuba as mi
 
 from ..core.arrays import opaque_index
 from ..core.points import kronecker, triangle
+from ..scene import Model
 from ..transport.emit import AT_ONCE
-from .solve import RAYS_PER_ELEMENT, wanted_elements
+from .solve import default_rays, wanted_elements
 
 PROBES = 1 << 19  # rays that are timed
 # Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
@@ -28,13 +29,13 @@ class Cost:
     seconds: float
 
 
-def estimate_cost(model, elements: int | None = None, rays: int | None = None) -> Cost:
+def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
     """What solving a Model costs, by default or with so many elements and rays; good to a factor of two.
 
     Time is a multiple of what some rays take that are traced here and now.
     """
-    count = wanted_elements(model, elements, None)
-    rays = rays or RAYS_PER_ELEMENT * count
+    count = wanted_elements(model, elements, None) or model.patches.count
+    rays = rays or default_rays(count)
     _trace(model)  # once before, as kernels are compiled
     start = time.perf_counter()
     _trace(model)

@@ -1,5 +1,7 @@
 """Irradiance as a continuous field over each flat or smooth surface (Gouraud)."""
 
+from typing import Any  # a Solution has a Field
+
 import drjit as dr
 import mitsuba as mi
 
@@ -27,7 +29,7 @@ class Field:
     [6 · elements]. NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution, irradiance=None):
+    def __init__(self, solution: Any, irradiance: "mi.Color3f | None" = None) -> None:
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
         self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
@@ -57,18 +59,18 @@ class Field:
         dr.eval(self.nodes, self._points, self._walled)
 
     @property
-    def walled(self):
+    def walled(self) -> "mi.Bool":
         """Which leaves does a wall stand on (Bool [elements])?"""
         return self._walled
 
     @property
-    def of_leaves(self):
+    def of_leaves(self) -> "mi.Color3f":
         """H of the leaves themselves (Color3f [leaves])."""
         return dr.gather(mi.Color3f, self.flat, self._elements.leaves)
 
     # ---- Looking up ----------------------------------------------------------------------------
 
-    def at(self, leaf, u, v, active=True):
+    def at(self, leaf: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """H at patch points (u, v) on leaves (Color3f [n])."""
         e = self._elements
         a, b = e.own_point(leaf, u, v, active)

@@ -1,13 +1,16 @@
 """What a solve leaves behind."""
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.arrays import NONE, owned, owned_vectors
 from ..core.errors import RadiosityError
@@ -46,7 +49,7 @@ class Leaves:
     irradiance: np.ndarray  # [leaves, 3] W/m²
     radiosity: np.ndarray  # [leaves, 3] W/m²
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.area)
 
 
@@ -70,15 +73,15 @@ class Solution:
 
     def irradiance(
         self,
-        points=None,
-        normals=None,
+        points: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
         *,
         lux: bool = False,
         samples: int = 1024,
         seed: int = 0,
         return_error: bool = False,
         progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
-    ):
+    ) -> "np.ndarray | tuple[np.ndarray, np.ndarray] | mi.Color3f":
         """Irradiance H at any points of the scene, gathered there: W/m² per channel (NumPy [n, 3]), or with ``lux``
         illuminance, lx (NumPy [n]): 179 lm/W times the luminance of H by Rec. 709's weights.
 
@@ -90,18 +93,18 @@ class Solution:
         """
         if points is None:
             return self.direct + self.indirect
-        points, normals = _checked_points(points, normals)
+        where, towards = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
         gatherer = self.gatherer()
         report = partial(progress, "gather")
-        found = probe(gatherer, self.model, points, normals, samples, seed, lambda done: report(done, len(points)))
+        found = probe(gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
         if lux:
             # The channels' errors go together, as their samples are the same.
-            found = tuple(LUMENS_PER_WATT * values @ LUMINANCE for values in found)
+            found = (LUMENS_PER_WATT * found[0] @ LUMINANCE, LUMENS_PER_WATT * found[1] @ LUMINANCE)
         return found if return_error else found[0]
 
-    def radiosity(self, points=None, normals=None):
+    def radiosity(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> "np.ndarray | mi.Color3f":
         """B = E + ρ H, W/m², of the continuous field on the surface nearest to each point (NumPy [n, 3]); NaN for
         points farther from all than 1 % of the scene's diagonal.
 
@@ -111,14 +114,14 @@ class Solution:
         """
         if points is None:
             return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
-        points, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
-        if len(points) == 0:
+        where, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
+        if len(where) == 0:
             return np.zeros((0, 3))
         model, rays = self.model, self.model.rays
         given = 0 * given if normals is None else given
-        face, u, v, near = nearest_face(model.faces, points, given, lift_of(model.faces))
+        face, u, v, near = nearest_face(model.faces, where, given, lift_of(model.faces))
         facing = dr.dot(owned_vectors(mi.Vector3f, given), dr.gather(mi.Vector3f, rays.front, face))
-        front, back = (rays.side(face, dr.full(mi.Bool, side, len(points)), u, v, near) for side in (False, True))
+        front, back = (rays.side(face, dr.full(mi.Bool, side, len(where)), u, v, near) for side in (False, True))
         behind = facing < 0 if normals is not None else front.patch == NONE
         hit = dr.select(behind, back, front)
         return np.where(np.array(near)[:, None], np.array(self._shown_radiosity(hit)).T, np.nan)
@@ -168,7 +171,9 @@ class Solution:
             radiosity=of(mi.Color3f, self.radiosity()),
         )
 
-    def render(self, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+    def render(
+        self, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+    ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         Raises RadiosityError if the scene has been edited since it was solved.
@@ -185,13 +190,13 @@ class Solution:
 
     # ---- Files ---------------------------------------------------------------------------------
 
-    def save(self, path, source: dict | None = None) -> None:
+    def save(self, path: str | os.PathLike[str], source: dict | None = None) -> None:
         """Write the solution as NumPy archive (.npz); no file is left half-written.
 
         source: where the scene came from, for `source_of` to tell.
         """
         e = self.elements
-        arrays = {name: np.array(getattr(e, name)) for name in TREE}
+        arrays: dict[str, Any] = {name: np.array(getattr(e, name)) for name in TREE}
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
@@ -208,7 +213,7 @@ class Solution:
             )
 
     @staticmethod
-    def source_of(path) -> dict | None:
+    def source_of(path: str | os.PathLike[str]) -> dict | None:
         """Where the scene of a kept solution came from, as `save` was told; None if it was not.
 
         Raises RadiosityError if the file is no solution, or is damaged.
@@ -217,7 +222,7 @@ class Solution:
         return json.loads(str(data["source"])) if "source" in data else None
 
     @staticmethod
-    def load(path, scene: "mi.Scene | Model") -> "Solution":
+    def load(path: str | os.PathLike[str], scene: "mi.Scene | Model") -> "Solution":
         """Read a solution of ``scene``.
 
         Raises RadiosityError if the file is no solution, is damaged, or belongs to another scene.

@@ -16,8 +16,8 @@ from ..transport import PILOT, Gathering, Problem, Shooting, Transport
 from .refine import Refinement
 from .solution import Solution
 
-ELEMENTS = 19_000  # default mesh: so many leaves more than patches, or twice the patches
-RAYS_PER_ELEMENT = 300  # default ray budget
+ELEMENTS = 19_000  # default mesh: so many leaves more than patches
+RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 
 
 @interruptible()
@@ -38,8 +38,9 @@ def solve(
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more than the scene has patches, or twice the patches, unless the oracle finds less
-    to refine. rays: rays that carry the power, used exactly; 300 per element by default. lines: random
+    either, 19,000 more than the scene has patches, unless the oracle finds less
+    to refine. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
+    elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
     default. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
@@ -73,7 +74,7 @@ def solve(
     problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
     clock.lap("refine")
 
-    rays = int(rays or RAYS_PER_ELEMENT * tree.leaf_count)
+    rays = int(rays or default_rays(tree.leaf_count))
     gathering = Gathering(problem, rays, seed)
     shot = rays - gathering.rays
     flow = transport(
@@ -123,16 +124,22 @@ def _check(oracle, elements, epsilon, rays, lines):
         raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
 
 
-def wanted_elements(model, elements, epsilon):
+def default_rays(elements: int) -> int:
+    """The ray budget of so many leaf elements where none is given."""
+    return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
+
+
+def wanted_elements(model: Model, elements: int | None, epsilon: float | None) -> int | None:
     """Leaves to refine to, or None where ε decides."""
     count = model.patches.count
     if epsilon is not None:
         return None
     if elements is None:
-        return count + max(ELEMENTS, count)
+        return count + ELEMENTS
     if elements < count:
         raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: ask for at least {count} elements"
+            f"the scene has {count} patches, so {elements} elements cannot be reached: "
+            f"ask for at least {count} elements"
         )
     return elements
 
@@ -140,9 +147,9 @@ def wanted_elements(model, elements, epsilon):
 class _Clock:
     """Seconds by stage."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._start = self._last = time.perf_counter()
-        self._stages = {}
+        self._stages: dict[str, float] = {}
 
     def lap(self, stage):
         dr.sync_thread()

@@ -7,12 +7,15 @@ import mitsuba as mi
 
 from ..core.arrays import NONE
 from ..core.points import triangle
+from ..mesh import Elements, Exposure
+from ..scene import Model
 from .lamps import LampChoice
+from .landings import Landings
 
 
 @dataclass
 class Places:
-    """Points that look for light, [n]; relative to the patches' origin. ``leaf``: the elements they lie on, if known."""
+    """Points that look for light, [n]; relative to the patches' origin. ``leaf``: elements they lie on, if known."""
 
     x: "mi.Point3f"
     normal: "mi.Vector3f"
@@ -22,19 +25,29 @@ class Places:
 class Gatherer:
     """Irradiance at points of a scene whose radiosity is known.
 
-    reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses a
-    leaf that light is. Each sample is one line to the lamps, or one
-    cosine-distributed ray, and its value an unbiased estimate. Where both are drawn, lamps are found by both; the
-    balance heuristic (Veach 1997) weighs them, so that no estimate exceeds their exitance however near they are.
+    reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses
+    a leaf that light is. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
+    an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
+    so that no estimate exceeds their exitance however near they are.
     """
 
-    def __init__(self, model, elements, exposure, landings, reflected) -> None:
+    def __init__(
+        self, model: Model, elements: Elements, exposure: Exposure, landings: Landings, reflected: "mi.Color3f"
+    ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
         self._exposure, self._landings = exposure, landings
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
 
-    def lines(self, places, lot, s, t, rays_per_line=0.0, active=True):
+    def lines(
+        self,
+        places: Places,
+        lot: "mi.Float",
+        s: "mi.Float",
+        t: "mi.Float",
+        rays_per_line: float = 0.0,
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Color3f":
         """H from the lamps along lines to points of them (Color3f [n]): E F / (p + c F), p the density of the point.
 
         lot, s, t: uniform numbers that draw a lamp and a point of it; rays_per_line: c, how many `rays` there are per
@@ -52,7 +65,15 @@ class Gatherer:
             total += light.lights_up(rays, x, normal, s, t, active, rays_per_line)
         return total
 
-    def rays(self, places, direction, number, seed, rays_per_line=None, active=True):
+    def rays(
+        self,
+        places: Places,
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        rays_per_line: float | None = None,
+        active: "mi.Bool | bool" = True,
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
         """H from the room, and H from the lamps, that cosine-distributed rays meet (two Color3f [n]).
 
         number: UInt32 [n], seed: UInt32, what rays draw lobes by. rays_per_line: see `lines`; without lines, None.

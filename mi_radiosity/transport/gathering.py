@@ -13,6 +13,7 @@ from ..mesh.hierarchy import pull
 from .emit import AT_ONCE
 from .gather import Gatherer, Places
 from .landings import Landings
+from .problem import Flow, Problem
 
 SHARE = 0.8  # of the rays are gathered with; the others find the radiosity that is gathered
 RAYS_PER_LINE = 2  # rays into the room per line to the lamps
@@ -30,7 +31,7 @@ class Gathering:
     What is shot keeps all power to the letter: what is gathered is scaled to its total, as far as that is known better.
     """
 
-    def __init__(self, problem, budget: int, seed: int) -> None:
+    def __init__(self, problem: Problem, budget: int, seed: int) -> None:
         self._problem, self._seed = problem, stream_seed(seed, Stream.GATHER)
         leaves = problem.elements.leaves
         area = np.array(dr.gather(mi.Float, problem.exposure.open_area, leaves), dtype=np.float64)
@@ -38,7 +39,7 @@ class Gathering:
         self._lines, self._count = lines, int(lines.sum())
         self.rays = (1 + RAYS_PER_LINE) * self._count
 
-    def feed(self, flow, progress: Callable[[int], None] = lambda done: None):
+    def feed(self, flow: Flow, progress: Callable[[int], None] = lambda done: None) -> Flow:
         """``flow`` with its irradiance replaced by what the leaves gather."""
         if self.rays == 0:
             return flow

@@ -2,9 +2,10 @@
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.arrays import NONE, Distribution, lower_bound_within, opaque_index, totals
+from ..mesh import Elements
+from ..scene import Model
 
 MOST = 1 << 24  # entries of the table of leaves and lamps; with more lamps than that, they are chosen by power
 BY_POWER = 0.1  # share of lines that are drawn by power whatever the place
@@ -17,7 +18,7 @@ class LampChoice:
     light it may bring. ``count``: how many lamp patches there are.
     """
 
-    def __init__(self, model, elements) -> None:
+    def __init__(self, model: Model, elements: Elements) -> None:
         self._patches, self._elements = model.patches, elements
         self.lamps = dr.compress(dr.max(self._patches.emission) > 0)
         self.count = dr.width(self.lamps)
@@ -57,7 +58,7 @@ class LampChoice:
         dr.scatter(self._row, dr.arange(mi.UInt32, dr.width(leaves)), leaves)
         dr.eval(self._rows, self._row)
 
-    def draw(self, lot, leaf=None):
+    def draw(self, lot: "mi.Float", leaf: "mi.UInt32 | None" = None) -> "tuple[mi.UInt32, mi.Float]":
         """A lamp drawn with ``lot`` in [0, 1) for places on leaves: its patch, and the density of points on it, 1/m²
         (UInt32, Float [n]). Without leaves, by power."""
         if leaf is None or self._rows is None:
@@ -69,7 +70,9 @@ class LampChoice:
             number = lower_bound_within(self._rows, lot * top, first, last) - first
         return dr.gather(mi.UInt32, self.lamps, number), self._density(number, leaf)
 
-    def density(self, patch, leaf=None, active=True):
+    def density(
+        self, patch: "mi.UInt32", leaf: "mi.UInt32 | None" = None, active: "mi.Bool | bool" = True
+    ) -> "mi.Float":
         """Density of the points that `draw` puts on patches, 1/m²; 0 for those that are no lamps (Float [n])."""
         number = dr.gather(mi.UInt32, self._number, patch, active)
         is_lamp = active & (number != NONE)

@@ -1,18 +1,29 @@
 """Irradiance at any points, with its standard error."""
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import opaque_index, owned_vectors
 from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed
+from ..scene import Model
 from .gather import Gatherer, Places
 
 RUNS = 16  # of samples per point, whose spread is the error
 AT_ONCE = 1 << 22  # samples, which bounds memory
 
 
-def probe(gatherer: Gatherer, model, points, normals, samples, seed, progress=lambda done: None):
+def probe(
+    gatherer: Gatherer,
+    model: Model,
+    points: np.ndarray,
+    normals: np.ndarray,
+    samples: int,
+    seed: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[np.ndarray, np.ndarray]:
     """H at points, and its standard error (two float64 [n, 3], W/m²).
 
     points [n, 3] of the scene; normals [n, 3] of unit length; samples: lines to the lamps, and as many rays into the

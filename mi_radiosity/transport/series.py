@@ -57,7 +57,14 @@ class Shooting(Transport):
     deposit: Callable = trusted
     records: bool = False
 
-    def __call__(self, problem, rays, seed, first_share=0.5, progress=lambda done: None):
+    def __call__(
+        self,
+        problem: Problem,
+        rays: int,
+        seed: int,
+        first_share: float = 0.5,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Flow:
         series = _Series(self, problem, rays, seed, first_share)
         while series.left > 0 and sum(series.unshot) > 0:
             series.iterate(progress)
@@ -70,7 +77,7 @@ PILOT = Shooting(tail=0.1, numbering=numbered_by_leaf, deposit=spread, records=T
 class _Series:
     """One run of Shooting."""
 
-    def __init__(self, how, problem, rays, seed, first_share):
+    def __init__(self, how: Shooting, problem: Problem, rays: int, seed: int, first_share: float) -> None:
         self.how, self.problem, self.seed, self.rays = how, problem, seed, rays
         elements, area = problem.elements, problem.exposure.open_area
         self.area = mi.Float64(dr.gather(mi.Float, area, elements.leaves))

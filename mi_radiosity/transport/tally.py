@@ -1,9 +1,14 @@
 """Where power ends: exact sums per element, and what escapes or is blocked."""
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, ColorSums, opaque_index
+from ..scene.lobes import Trail
+from ..scene.rays import Hit
+from .emit import Batch
 
 
 class Tally:
@@ -12,15 +17,15 @@ class Tally:
     ESCAPED, BLOCKED = 0, 1  # left the scene; absorbed by a side that reflects nothing
     SENT, TAKEN = 2, 3  # of rays that go on through lobes: what was sent, and what the lobes on the way kept
 
-    def __init__(self, elements, unshot, lobes=False):
+    def __init__(self, elements: int, unshot: Sequence[float], lobes: bool = False) -> None:
         self._elements, self._lobes = elements, lobes
         self.sums = ColorSums(elements + (4 if lobes else 2), [8 * u for u in unshot])
 
-    def add(self, batch, hit, receiver, active=True):
+    def add(self, batch: Batch, hit: Hit | Trail, receiver: "mi.UInt32", active: "mi.Bool | bool" = True) -> None:
         """Rays of a Batch end at hits; those on patches are for elements ``receiver``."""
         lost = dr.select(hit.valid, self._bin(self.BLOCKED), self._bin(self.ESCAPED))
         power = batch.power
-        if self._lobes:
+        if isinstance(hit, Trail):
             every = dr.zeros(mi.UInt32, dr.width(receiver))
             taken = [p * mi.Float64(t) for p, t in zip(power, hit.taken)]
             self.sums.add(power, every + self._bin(self.SENT), active)
@@ -31,11 +36,11 @@ class Tally:
     def _bin(self, which):
         return opaque_index(self._elements + which)
 
-    def gather(self, element):
+    def gather(self, index: "mi.UInt32") -> "list[mi.Float64]":
         """What elements received (3 Float64 [n])."""
-        return self.sums.gather(element)
+        return self.sums.gather(index)
 
-    def lost(self, which) -> list[float]:
+    def lost(self, which: int) -> list[float]:
         """What went into a named bin, per channel."""
         if which > self.BLOCKED and not self._lobes:
             return [0.0] * 3
