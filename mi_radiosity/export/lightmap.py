@@ -138,34 +138,22 @@ def _in_one_place(model, points, normals, valid):
 
 
 def fill(values: np.ndarray, known: np.ndarray, chart: np.ndarray) -> np.ndarray:
-    """Fill texels that nothing is known of from their neighbours: those of charts, and RINGS around them."""
-    values, known, chart = values.copy(), known.copy(), chart.copy()
-    rings = 0
-    while rings < RINGS:
-        total, count, label = np.zeros_like(values), np.zeros(known.shape), np.full(chart.shape, -1)
-        for dy, dx in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
-            there, here = _shifted(dy, dx)
-            label[here] = np.where((label[here] < 0) & known[there], chart[there], label[here])
-            same = known[there] & np.where(chart[here] >= 0, chart[here] == chart[there], label[here] == chart[there])
-            total[here] += np.where(same[..., None], values[there], 0)
-            count[here] += same
-        inner = ~known & (chart >= 0) & (count > 0)
-        new = inner if inner.any() else ~known & (chart < 0) & (count > 0)
-        rings += not inner.any()
-        values[new] = total[new] / count[new][:, None]
-        chart[new & (chart < 0)] = label[new & (chart < 0)]
-        known |= new
-    return values
+    """Fill texels that nothing is known of from the nearest ones: those of charts, and RINGS around them.
 
+    values: [size, size, …]; known: bool [size, size]; chart: numbers of the charts, −1 for none [size, size].
+    """
+    ndimage: Any = optional("scipy.ndimage", "a lightmap", "export")
 
-def _shifted(dy, dx):
-    """Slices of an image: texels, and the neighbours of these."""
+    def nearest_to(which):
+        return ndimage.distance_transform_cdt(~which, metric="chessboard", return_indices=True)
 
-    def along(d):
-        return slice(max(d, 0), d if d < 0 else None), slice(max(-d, 0), -d if d > 0 else None)
-
-    (ty, hy), (tx, hx) = along(dy), along(dx)
-    return (ty, tx), (hy, hx)
+    if not known.any():
+        return values
+    _, (row, column) = nearest_to(known)
+    inner = (chart >= 0) & (chart == chart[row, column])
+    values = np.where(inner[..., None], values[row, column], values)
+    distance, (row, column) = nearest_to(inner)
+    return np.where((~inner & (distance <= RINGS))[..., None], values[row, column], values)
 
 
 def _denoised(irradiance):
