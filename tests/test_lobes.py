@@ -1,13 +1,12 @@
 """Lobes that are not diffuse: every material of Mitsuba against `path`, energy, and what stays as it was."""
 
 import mi_radiosity as mr
+from mi_radiosity.scene import Model
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import balance
-
-from mi_radiosity.scene import Model
 
 COLOR = {"type": "rgb", "value": [0.5, 0.3, 0.2]}
 DIFFUSE = {"type": "diffuse", "reflectance": COLOR}
