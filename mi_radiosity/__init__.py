@@ -9,10 +9,11 @@ import mitsuba as _mi
 from .core.errors import RadiosityError
 from .display import Shader
 from .display import register as _register
+from .export.factors import read_factors, write_factors
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
 from .solver import Solution, solve
-from .transport import Shooting, Transport
+from .transport import Shooting, Transport, ViewFactors, view_factors
 
 __version__ = "0.2.0"
 __all__ = [
@@ -30,9 +31,13 @@ __all__ = [
     "Solution",
     "Transport",
     "Uniform",
+    "ViewFactors",
     "information_gap",
     "mesher",
+    "read_factors",
     "solve",
+    "view_factors",
+    "write_factors",
 ]
 
 _register()

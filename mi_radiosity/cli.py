@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
+from .export.commands_factors import view_factors, view_factors_arguments
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
@@ -20,7 +21,13 @@ if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     from .solver import Solution
 
 PROGRAM = "mi-radiosity"
-STAGES = {"refine": "Refining", "distribute": "Distributing power"}
+STAGES = {
+    "refine": "Refining",
+    "distribute": "Distributing power",
+    "trace": "Tracing rays",
+    "connect": "Connecting facets",
+    "write": "Writing",
+}
 SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")
 
 Report = Callable[[str, int, int | None], None]
@@ -57,9 +64,10 @@ def _parser() -> Parser:
         (_reference_arguments, _reference, "path-trace a reference; resumes, never starts over"),
         (_compare_arguments, _compare, "compare oracles: error beside cost, against a path-traced reference"),
         (_bench_arguments, _bench, "error against time: ours, path, and path with a denoiser"),
+        (view_factors_arguments, view_factors, "view factors between shapes or faces, as a sparse matrix"),
         (lambda parser: None, _info, "say what of a scene would be modelled, what not and why"),
     ):
-        command = commands.add_parser(run.__name__.strip("_"), help=text)
+        command = commands.add_parser(run.__name__.strip("_").replace("_", "-"), help=text)
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
@@ -387,6 +395,7 @@ def _prepare(arguments: argparse.Namespace) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
+    arguments.progress_bars = progress_bars
     if "shading" in arguments:
         SHADERS.find(arguments.shading)
 

@@ -12,11 +12,11 @@ WEIGHTS = 2.0**46  # resolution of a Distribution
 
 
 def owned(kind, array):
-    """A Dr.Jit array (mi.Float or mi.UInt32) with a copy of a NumPy array of one dimension.
+    """A Dr.Jit array (mi.Float, mi.Float64 or mi.UInt32) with a copy of a NumPy array of one dimension.
 
     Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
     """
-    kept = np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32)
+    kept = np.ascontiguousarray(array, dtype={mi.Float: np.float32, mi.Float64: np.float64}.get(kind, np.uint32))
     copy = dr.empty(kind, len(kept))
     if len(kept):
         dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))

@@ -27,6 +27,7 @@ class Stream(IntEnum):
     STARVED = 4  # lines and rays of leaves that gather
     REACH = 5  # rays that look for light while a scene is read
     MEASURE = 6  # irradiance at points of the user's
+    FACTORS = 9  # rays and lines that view factors are made of
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

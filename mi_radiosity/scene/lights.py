@@ -66,16 +66,17 @@ class Area(Light):
 class Lights:
     """The lamps of a scene: ``exitance`` of its faces, W/m² [faces, 3], and the ``free`` ones that are no surfaces.
 
-    Raises RadiosityError if there is no light, or if a lamp's is impossible, naming the shape.
+    Raises RadiosityError if there is no light where it is ``required``, or if a lamp's is impossible, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces, required=True):
         self.exitance = self._of_faces(faces)
         box = faces.corners.min(axis=(0, 1)), faces.corners.max(axis=(0, 1))
         centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0]) / 2)
         kinds = [(emitter, LIGHTS.find(emitter.class_name())) for emitter in faces.scene.emitters()]
         self.free = [kind(emitter, centre, radius) for emitter, kind in kinds if not kind.on_surface]
-        if not (self.exitance * faces.area[:, None]).any() and not any(any(light.power()) for light in self.free):
+        lit = (self.exitance * faces.area[:, None]).any() or any(any(light.power()) for light in self.free)
+        if required and not lit:
             raise RadiosityError("the scene has no light: give at least one shape an 'area' emitter")
 
     @staticmethod

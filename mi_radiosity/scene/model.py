@@ -18,27 +18,28 @@ from .state import State
 class Model:
     """A Mitsuba scene read once: ``faces``, ``materials``, ``lights``, ``patches`` and the ``rays`` between them.
 
-    sides: patches to make (see `Patches`); by default those that light can reach. ``warnings``: what a user should
-    know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
+    sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
+    not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
     orientation, reflectance and emission. ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
 
-    def __init__(self, scene, sides: np.ndarray | None = None):
+    def __init__(self, scene, sides: np.ndarray | None = None, lit: bool = True):
         require_variant()
         require_supported(scene)
         self.scene, self.state = scene, State(scene)
         self.faces = Faces(scene)
         self.materials = Materials(self.faces)
-        self.lights = Lights(self.faces)
+        self.lights = Lights(self.faces, required=lit)
         self.fingerprint = self._fingerprint()
         overlaps = self._find_overlaps()
         self.unreached = 0
         if sides is None:
-            candidates = self._sides(self._candidate & ~overlaps.covered)
-            lit = reached(self._rays(candidates, overlaps), self.lights)
-            sides, self.unreached = candidates[lit], int((~lit).sum())
+            sides = self._sides(self._candidate & ~overlaps.covered)
+            if lit:
+                found = reached(self._rays(sides, overlaps), self.lights)
+                sides, self.unreached = sides[found], int((~found).sum())
         kept, doubled = overlaps.among(self._numbers(sides))
         self.rays = self._rays(sides, kept)
         self.patches = self.rays.patches

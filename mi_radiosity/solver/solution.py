@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream
 from ..mesh import Elements, Exposure
 from ..mesh.subdivision import NODES
 from ..scene import Model
-from ..transport import Gatherer
+from ..transport import Gatherer, ViewFactors, view_factors
 from ..transport.landings import Landings
 
 FORMAT = 3
@@ -114,6 +115,13 @@ class Solution:
         integrator = mi.load_dict({"type": "radiosity"})
         integrator.show(self, shading)
         return integrator.picture(self.model.scene, sensor, seed, spp)
+
+    def view_factors(self, level: str = "face", rays: int | None = None, **options: Any) -> ViewFactors:
+        """View factors between shapes, faces or leaves of the mesh, those that light can reach.
+
+        level: "shape", "face" or "leaf"; rays and further options as in `mi_radiosity.view_factors`.
+        """
+        return view_factors(self.model, level, rays, elements=self.elements, **options)
 
     def require_unchanged(self) -> None:
         """Raise RadiosityError if the scene is not as it was when it was solved."""

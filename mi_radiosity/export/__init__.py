@@ -1,0 +1,1 @@
+"""Taking it home: solutions and view factors in the formats of other programs."""
