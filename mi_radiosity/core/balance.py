@@ -53,7 +53,8 @@ def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarr
         diagonal = np.where(idle, 1.0, slopes @ ones + (outer * give).sum(axis=0))
         hessian = linalg.LinearOperator(matrix.shape, lambda v: diagonal * v + slopes @ v)
         jacobi = linalg.LinearOperator(matrix.shape, lambda v: v / diagonal)
-        step, _ = linalg.cg(hessian, -miss, rtol=ACCURACY, maxiter=300, M=jacobi)
+        with np.errstate(all="ignore"):  # singular where no y fits
+            step = np.nan_to_num(linalg.cg(hessian, -miss, rtol=ACCURACY, maxiter=300, M=jacobi)[0])
         slope, length = miss @ step, 1.0
         while True:  # until the slope along the step, which only grows, is small enough
             trial = at(y + length * step)

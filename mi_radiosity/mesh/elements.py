@@ -25,6 +25,16 @@ class Elements:
     ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
     """
 
+    patch: "mi.UInt32"
+    parent: "mi.UInt32"
+    child: "mi.UInt32"
+    place: "mi.UInt32"
+    u0: "mi.Float"
+    v0: "mi.Float"
+    scale: "mi.Float"
+    area: "mi.Float"
+    reflectance: "mi.Color3f"
+
     def __init__(self, patches, arrays):
         self.patches = patches
         for name in ARRAYS:
@@ -44,6 +54,13 @@ class Elements:
         leaves = dr.compress(self.child == 0)
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
+
+    def with_patches(self, patches) -> "Elements":
+        """The same elements, frozen, of patches that differ in their light only."""
+        self.leaves  # noqa: B018  sorted once for all
+        other = object.__new__(Elements)
+        other.__dict__.update(self.__dict__ | {"patches": patches})
+        return other
 
     def level(self, element):
         """How often the patch was split (UInt32 [n])."""

@@ -70,7 +70,7 @@ class Lights:
     """
 
     def __init__(self, faces, required=True):
-        self.exitance = self._of_faces(faces)
+        self.exitance, self.required = self._of_faces(faces), required
         box = faces.corners.min(axis=(0, 1)), faces.corners.max(axis=(0, 1))
         centre, radius = (box[0] + box[1]) / 2, float(np.linalg.norm(box[1] - box[0]) / 2)
         kinds = [(emitter, LIGHTS.find(emitter.class_name())) for emitter in faces.scene.emitters()]

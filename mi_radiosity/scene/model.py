@@ -19,7 +19,8 @@ class Model:
     """A Mitsuba scene read once: ``faces``, ``materials``, ``lights``, ``patches`` and the ``rays`` between them.
 
     sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
-    not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
+    not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many
+    sides no light reaches. ``fingerprint``: SHA-256 of geometry,
     orientation, reflectance and emission. ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
@@ -47,7 +48,7 @@ class Model:
 
     def with_sides(self, sides) -> "Model":
         """The same scene with other patches."""
-        return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides)
+        return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides, self.lights.required)
 
     def _find_overlaps(self):
         """Faces in one another: one of them is lit and shown wherever several are."""

@@ -20,7 +20,8 @@ from .contour import exchange_area
 from .facets import AT_ONCE, OUTSIDE, Counts, Facets, count_rays
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
-FEW, MANY = 8, 32  # rays between two cells: below FEW their number decides, above MANY lines and contours do
+FEW = 8  # rays between two cells that lines are worth
+RAMP = 16, 64  # rays to expect between two cells from where on lines count, and decide alone
 LINES = 8  # lines come in blocks of so many
 
 
@@ -59,10 +60,10 @@ class ViewFactors:
     def radiosity(
         self, emission: np.ndarray, reflectance: np.ndarray, outside: np.ndarray | float = 0.0, accuracy: float = 1e-9
     ) -> np.ndarray:
-        """B = E + ρ (F B + F_outside B_outside), W/m² like E, for many right-hand sides at once ([rows] or [rows, cases]).
+        """B = E + ρ (F B + F_outside B_outside), W/m² like E: [rows], or [rows, cases] for many right-hand sides at once.
 
         reflectance: ρ < 1 [rows] (in infrared 1 − ε, and E = ε σ T⁴). outside: B of sky, ground and backs, as far as
-        there are such columns. Summed as Neumann series until nothing changes by more than ``accuracy``, relatively.
+        there are such columns: one number, [columns] or [columns, cases]. Summed as Neumann series until nothing changes by more than ``accuracy``, relatively.
         """
         emission = np.asarray(emission, dtype=np.float64)
         rho = np.asarray(reflectance, dtype=np.float64).reshape(-1, *[1] * (emission.ndim - 1))
@@ -70,7 +71,9 @@ class ViewFactors:
             raise RadiosityError(f"give {len(self.areas)} emissions and as many reflectances below 1")
         between, beyond = self.between, self.F[:, len(self.areas) :]
         if beyond.shape[1]:
-            emission = emission + rho * (beyond @ np.broadcast_to(outside, (beyond.shape[1], *emission.shape[1:])))
+            sky = np.asarray(outside, dtype=np.float64)
+            sky = sky[:, None] if sky.ndim == 1 and emission.ndim == 2 else sky
+            emission = emission + rho * (beyond @ np.broadcast_to(sky, (beyond.shape[1], *emission.shape[1:])))
         B = more = emission
         while np.abs(more).max(initial=0) > accuracy * np.abs(B).max(initial=0):
             more = rho * (between @ more)
@@ -116,7 +119,7 @@ def view_factors(
 
 
 class _Exchange:
-    """Exchange areas A_i F_ij of cells, a symmetric SciPy CSR ``area`` [cells, cells], and the ``variance`` of its data."""
+    """Exchange areas A_i F_ij: a symmetric SciPy CSR ``area`` [cells, cells], and the ``variance`` of its data."""
 
     def __init__(self, facets, counts: Counts, seed, progress):
         self.facets, self.progress = facets, progress
@@ -147,17 +150,18 @@ class _Exchange:
     def _refine(self, chosen, count):
         """Blend in what lines say of pairs i < j that ``count`` rays connect.
 
-        Weights a(N) of the lines and b(N) of the rays with a(N) + b(N + 1) = 1 leave the mean as it is, although N is
-        one of the estimates: E[N b(N)] = λ E[b(N + 1)] (Stein and Chen). So pairs may be chosen by the rays they got.
+        What decides is how many rays should connect them by what the lines say, not how many do: a weight that goes with
+        one of the estimates would shift the mean. Pairs that lines decide have FEW rays all but certainly.
         """
         i, j, corners = self._of[chosen], self.area.indices[chosen], self.facets.corners
         whole, blocks = exchange_area(corners[i], corners[j]), -(-count // LINES)
         share, lines = self._visible(i, j, blocks), LINES * blocks
         self.lines = int(lines.sum(dtype=np.int64))
         likely = (share * lines + 1) / (lines + 2)
-        a, b = _ramp(count + 1), 1 - _ramp(count)
-        area = a * whole * share + b * self.area.data[chosen]
-        variance = a**2 * whole**2 * likely * (1 - likely) / lines + b**2 * self.variance[chosen]
+        expected = whole * share * (self.density[i] + self.density[j])
+        a = np.clip((expected - RAMP[0]) / (RAMP[1] - RAMP[0]), 0, 1)
+        area = a * whole * share + (1 - a) * self.area.data[chosen]
+        variance = a**2 * whole**2 * likely * (1 - likely) / lines + (1 - a) ** 2 * self.variance[chosen]
         for places in (chosen, self._places(j, i)):
             self.area.data[places], self.variance[places] = area, variance
 
@@ -211,10 +215,6 @@ def unblocked_kernel(patches, i, x, j, y):
     r2 = dr.squared_norm(d)
     cosines = dr.maximum(dr.dot(n_i, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
     return dr.select(r2 > 0, (cosines / r2) / r2 * dr.inv_pi, 0)
-
-
-def _ramp(count):
-    return np.clip((count - FEW) / (MANY - FEW), 0, 1)
 
 
 # ---- From exchange areas to a matrix -----------------------------------------------------------------
