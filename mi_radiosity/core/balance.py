@@ -8,7 +8,7 @@ from .extras import optional
 
 ROUNDS = 60  # of Newton's method
 CLOSE = 1e-13  # relative error of the sums that is as good as none
-ACCURACY = 1e-5  # of the linear systems
+ACCURACY = 1e-7, 1e-2  # of the linear systems, which goes with the error
 LEAST = 1e-10  # weight; what is certain gives way if nothing else can
 
 
@@ -24,45 +24,47 @@ def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarr
     """
     linalg = optional("scipy.sparse.linalg", "the closing of view factors", "factors")
     weight, give = np.maximum(weight, LEAST), np.maximum(give, LEAST)
-    row = np.repeat(np.arange(len(sums), dtype=np.int32), np.diff(matrix.indptr))
-    ones = np.ones(len(sums))
+    ones, each = np.ones(len(sums)), np.diff(matrix.indptr)
     idle = (matrix @ ones + outside.sum(axis=0) <= 0) | (sums <= 0)
     target = np.where(idle, 1.0, sums)
+    inner, slopes = (like(matrix, np.empty(matrix.nnz)) for _ in range(2))  # filled again and again
 
     def at(y):
-        """X' and O', and by how much rows miss their sums."""
+        """Fill X'; O', and by how much rows miss their sums."""
+        data = np.take(y, matrix.indices, out=inner.data, mode="clip")
         with np.errstate(over="ignore", invalid="ignore"):
-            data = y[row]
-            data += y[matrix.indices]
+            data += np.repeat(y, each)
             data *= weight
             np.exp(data, out=data)
             data *= matrix.data
-            inner, outer = like(matrix, data), outside * np.exp(give * y)
-            return inner, outer, np.where(idle, 0.0, inner @ ones + outer.sum(axis=0) - target)
+            outer = outside * np.exp(give * y)
+            return outer, np.where(idle, 0.0, inner @ ones + outer.sum(axis=0) - target)
 
-    y = np.zeros(len(sums))
-    inner, outer, miss = at(y)
-    best, least = (inner.data, outer), np.inf
+    y = best = np.zeros(len(sums))
+    (outer, miss), least = at(y), np.inf
     for _ in range(ROUNDS):
         error = np.abs(miss / target).max(initial=0)
         if error < least:
-            best, least = (inner.data, outer), error
+            best, least = y, error
         if error < CLOSE:
             break
-        slopes = like(inner, inner.data * weight)
+        np.multiply(inner.data, weight, out=slopes.data)
         diagonal = np.where(idle, 1.0, slopes @ ones + (outer * give).sum(axis=0))
         hessian = linalg.LinearOperator(matrix.shape, lambda v: diagonal * v + slopes @ v)
         jacobi = linalg.LinearOperator(matrix.shape, lambda v: v / diagonal)
         with np.errstate(all="ignore"):  # singular where no y fits
-            step = np.nan_to_num(linalg.cg(hessian, -miss, rtol=ACCURACY, maxiter=300, M=jacobi)[0])
+            accuracy = np.clip(error, *ACCURACY)
+            step = np.nan_to_num(linalg.cg(hessian, -miss, rtol=accuracy, maxiter=300, M=jacobi)[0])
         slope, length = miss @ step, 1.0
-        while True:  # until the slope along the step, which only grows, is small enough
-            trial = at(y + length * step)
-            if not abs(trial[2] @ step) > 0.9 * abs(slope) or length < 1e-6:
-                break
+        outer, miss = at(y + step)
+        # The slope along the step only grows: halve until it is small enough.
+        while abs(miss @ step) > 0.9 * abs(slope) and length > 1e-6:
             length /= 2
-        y, (inner, outer, miss) = y + length * step, trial
-    return best
+            outer, miss = at(y + length * step)
+        y = y + length * step
+    if y is not best:
+        outer, _ = at(best)
+    return inner.data, outer
 
 
 def like(matrix: Any, data: np.ndarray) -> Any:

@@ -44,7 +44,7 @@ class Lamps:
     def dimmed(self, scales: np.ndarray) -> Model:
         """The model with the lamps' emission times ``scales`` [lamps, 3]; all else, and its fingerprint, as it is."""
         factor = np.vstack([scales, np.ones(3)])
-        model, lights, rays = (copy.copy(x) for x in (self.model, self.model.lights, self.model.rays))
+        model, lights, rays = copy.copy(self.model), copy.copy(self.model.lights), copy.copy(self.model.rays)
         emission = self._emission * factor[self._of_patch]
         rays.patches = replace(self.model.patches, emission=owned_vectors(mi.Color3f, emission))
         lights.exitance = self.model.lights.exitance * factor[self._number[self.model.faces.shape]]

@@ -60,10 +60,11 @@ class ViewFactors:
     def radiosity(
         self, emission: np.ndarray, reflectance: np.ndarray, outside: np.ndarray | float = 0.0, accuracy: float = 1e-9
     ) -> np.ndarray:
-        """B = E + ρ (F B + F_outside B_outside), W/m² like E: [rows], or [rows, cases] for many right-hand sides at once.
+        """B = E + ρ (F B + F_outside B_outside), W/m²: [rows], or [rows, cases] for many right-hand sides at once.
 
-        reflectance: ρ < 1 [rows] (in infrared 1 − ε, and E = ε σ T⁴). outside: B of sky, ground and backs, as far as
-        there are such columns: one number, [columns] or [columns, cases]. Summed as Neumann series until nothing changes by more than ``accuracy``, relatively.
+        emission: E, so shaped. reflectance: ρ < 1 [rows]; in infrared it is 1 − ε, and E = ε σ T⁴. outside: B of sky,
+        ground and backs, as far as there are such columns: one number, [columns] or [columns, cases]. The Neumann series
+        is summed until nothing changes by more than ``accuracy``, relatively.
         """
         emission = np.asarray(emission, dtype=np.float64)
         rho = np.asarray(reflectance, dtype=np.float64).reshape(-1, *[1] * (emission.ndim - 1))
@@ -138,20 +139,26 @@ class _Exchange:
     def _by_rays(self):
         """From how many rays connect them, both ways; each way is binomial."""
         # The diagonal has been counted twice, as has its density.
-        i, j, cell = self._of, self.area.indices, self.facets.area
-        both = self.density[i] + self.density[j]
+        j, each = self.area.indices, np.diff(self.area.indptr)
+        both = np.repeat(self.density, each)
+        both += self.density[j]
         area = self.area.data / both
-        least = self.density[i] * (1 - np.minimum(area / cell[i], 1)) + self.density[j] * (
-            1 - np.minimum(area / cell[j], 1)
-        )
-        self.variance = (area * least / both**2).astype(np.float32)
+        part = self.density / self.facets.area
+        variance = np.repeat(part, each)
+        variance += part[j]
+        variance *= area
+        np.subtract(both, variance, out=variance)
+        variance *= area
+        variance /= both
+        variance /= both
+        self.variance = np.maximum(variance, 0, dtype=np.float32)
         self.area = like(self.area, area)
 
     def _refine(self, chosen, count):
         """Blend in what lines say of pairs i < j that ``count`` rays connect.
 
-        What decides is how many rays should connect them by what the lines say, not how many do: a weight that goes with
-        one of the estimates would shift the mean. Pairs that lines decide have FEW rays all but certainly.
+        What decides is how many rays should connect them by what the lines say, not how many do: a weight that goes
+        with one of the estimates would shift the mean. Pairs that lines decide have FEW rays all but certainly.
         """
         i, j, corners = self._of[chosen], self.area.indices[chosen], self.facets.corners
         whole, blocks = exchange_area(corners[i], corners[j]), -(-count // LINES)
@@ -253,20 +260,20 @@ def _closed(facets, counts, flow, start) -> ViewFactors:
         inner = inner * np.repeat(over, np.diff(X.indptr)).astype(inner.dtype)
         return _with_columns(like(X, inner), outer * over)
 
-    F, before = matrix(closed, beyond), matrix(X.data, O)
-    error = matrix(np.sqrt(V) * _ratio(closed, X.data), np.sqrt(P) * _ratio(beyond, O))
-    change = np.abs(F.data - before.data)
-
-    def miss(F):
-        return float(np.abs(F.sum(axis=1) - 1)[areas > 0].max(initial=0))
-
+    F, error = matrix(closed, beyond), matrix(np.sqrt(V) * _ratio(closed, X.data), np.sqrt(P) * _ratio(beyond, O))
+    closed -= X.data
+    closed *= np.repeat(over, np.diff(X.indptr))
+    change = [np.abs(closed), np.abs((beyond - O) * over).ravel()]
     return ViewFactors(
         F=F,
         error=error,
         names=(*facets.names, *(OUTSIDE[k] for k in there)),
         areas=areas,
         closure=Closure(
-            miss(before), miss(F), float(change.max(initial=0)), float(change.mean()) if len(change) else 0.0
+            raw_row_error=float(np.abs((X.sum(axis=1) + O.sum(axis=0)) * over - 1)[areas > 0].max(initial=0)),
+            row_error=float(np.abs(F.sum(axis=1) - 1)[areas > 0].max(initial=0)),
+            largest=float(max(x.max(initial=0) for x in change)),
+            mean=float(sum(x.sum() for x in change) / max(F.nnz, 1)),
         ),
         stats={"rays": int(counts.cast.sum()), "lines": flow.lines, "seconds": time.perf_counter() - start},
     )
