@@ -27,8 +27,8 @@ class Facets:
 
     level: "shape", all of a side of a shape; "face", a side of a face; "leaf", a leaf of the mesh. ``cells``: elements
     (UInt32 [cells]); ``number_of``: the cell of an element (UInt32 [elements]); ``row``, ``area`` (m²) and ``corners``
-    [cells, 3, 3] of the cells as NumPy arrays, row after row; ``names`` of the rows, "SHAPE[/FACE][/back][/LEAF]", in an
-    order that only names and geometry decide.
+    [cells, 3, 3] of the cells as NumPy arrays, row after row; ``names`` of the rows, "SHAPE[/FACE][/back][/LEAF]", in
+    an order that only names and geometry decide.
     """
 
     def __init__(self, model: Model, elements: Elements, level: str):

@@ -63,8 +63,8 @@ class ViewFactors:
         """B = E + ρ (F B + F_outside B_outside), W/m²: [rows], or [rows, cases] for many right-hand sides at once.
 
         emission: E, so shaped. reflectance: ρ < 1 [rows]; in infrared it is 1 − ε, and E = ε σ T⁴. outside: B of sky,
-        ground and backs, as far as there are such columns: one number, [columns] or [columns, cases]. The Neumann series
-        is summed until nothing changes by more than ``accuracy``, relatively.
+        ground and backs, as far as there are such columns: one number, [columns] or [columns, cases]. The Neumann
+        series is summed until nothing changes by more than ``accuracy``, relatively.
         """
         emission = np.asarray(emission, dtype=np.float64)
         rho = np.asarray(reflectance, dtype=np.float64).reshape(-1, *[1] * (emission.ndim - 1))
