@@ -7,8 +7,11 @@ _choose_llvm()  # before anything imports drjit
 import mitsuba as _mi
 
 from .core.errors import RadiosityError
+from .core.plugins import welcome_installed as _welcome_installed
 from .display import Shader
 from .display import register as _register
+from .export import export
+from .export import view as _view
 from .export.factors import read_factors, write_factors
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
@@ -32,6 +35,7 @@ __all__ = [
     "Transport",
     "Uniform",
     "ViewFactors",
+    "export",
     "information_gap",
     "mesher",
     "read_factors",
@@ -40,5 +44,14 @@ __all__ = [
     "write_factors",
 ]
 
-_register()
-_mi.detail.add_variant_callback(_register)
+Solution.view = _view  # type: ignore[attr-defined]  # rooms below do not know of this one
+
+
+def _follow_variant(*_: object) -> None:
+    if _mi.variant():
+        _register()
+        _welcome_installed()
+
+
+_follow_variant()
+_mi.detail.add_variant_callback(_follow_variant)

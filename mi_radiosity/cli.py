@@ -5,13 +5,17 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
-from .export.commands_factors import view_factors, view_factors_arguments
+from .export.commands import add_commands as add_export_commands
+from .export.commands import recall_scene
+from .export.commands_factors import add_view_factors
+from .export.commands_measure import add_measure
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
@@ -64,13 +68,15 @@ def _parser() -> Parser:
         (_reference_arguments, _reference, "path-trace a reference; resumes, never starts over"),
         (_compare_arguments, _compare, "compare oracles: error beside cost, against a path-traced reference"),
         (_bench_arguments, _bench, "error against time: ours, path, and path with a denoiser"),
-        (view_factors_arguments, view_factors, "view factors between shapes or faces, as a sparse matrix"),
         (lambda parser: None, _info, "say what of a scene would be modelled, what not and why"),
     ):
-        command = commands.add_parser(run.__name__.strip("_").replace("_", "-"), help=text)
+        command = commands.add_parser(run.__name__.strip("_"), help=text)
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
+    add_view_factors(commands, _scene_arguments, progress_bars)
+    add_measure(commands, _solution_arguments, progress_bars)
+    add_export_commands(commands, _loading_arguments, progress_bars)
     return parser
 
 
@@ -79,8 +85,19 @@ def _parser() -> Parser:
 
 
 def _scene_arguments(parser):
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
+    _loading_arguments(parser)
+
+
+def _solution_arguments(parser):
+    parser.add_argument("solution", type=Path, metavar="SOLUTION.npz", help="what render --save has kept")
+    parser.add_argument("--scene", type=Path, metavar="SCENE", help="the scene's file, if it is not where it was")
+    _loading_arguments(parser)
+    parser.set_defaults(mode=None)  # as it was kept
+
+
+def _loading_arguments(parser):
     add = parser.add_argument
-    add("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
     add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
     add(
         "-D",
@@ -129,7 +146,7 @@ def _solve_arguments(group):
 
 
 def _shading_argument(parser):
-    names = "gouraud, flat, mesh or a plugin's (default gouraud)"
+    names = "gouraud, flat, mesh, lux or a plugin's (default gouraud)"
     parser.add_argument("--shading", default="gouraud", metavar="NAME", help=names)
 
 
@@ -195,7 +212,7 @@ def _definition(text):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import write_image
+    from .display import SHADERS, Shader, write_image
 
     options = _solve_options(arguments)
     for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
@@ -210,6 +227,9 @@ def _render(arguments: argparse.Namespace) -> None:
             image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
             write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
+    shader: type[Shader] = SHADERS.find(arguments.shading)
+    if legend := shader.legend(solution):
+        print(legend)
     s = solution.stats
     print(
         f"{s['elements']:,} elements, {s['pairs']:,} pairs, {s['rays']:,} rays, {s['oracle_rays']:,} oracle rays, "
@@ -243,7 +263,7 @@ def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[st
 def _keep(arguments: argparse.Namespace, solution: "Solution") -> None:
     """Write what was asked for beside pictures."""
     if arguments.save:
-        solution.save(arguments.save)
+        solution.save(arguments.save, asdict(arguments.file))
     if arguments.stats:
         with writing(arguments.stats) as temporary:
             Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
@@ -393,9 +413,9 @@ def _prepare(arguments: argparse.Namespace) -> None:
     from .evaluation.scenes import scene_file
 
     mi.set_log_level(mi.LogLevel.Error)
+    recall_scene(arguments)
     arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
-    arguments.progress_bars = progress_bars
     if "shading" in arguments:
         SHADERS.find(arguments.shading)
 

@@ -148,7 +148,10 @@ def leaf_corners(solution):
 
 
 def border_values(solution):
-    """Field values on the borders of all leaves at dyadic points that are shown: positions [n, 3], normals, values [n, 3], shapes [n]."""
+    """Field values on the borders of all leaves, at dyadic points that are shown.
+
+    Positions [n, 3], normals [n, 3], values [n, 3] and shapes [n].
+    """
     e, model = solution.elements, solution.model
     leaves = np.array(e.leaves)
     level = np.round(-np.log2(np.abs(np.array(e.scale)[leaves]))).astype(int)

@@ -4,10 +4,14 @@ from fractions import Fraction
 
 from mi_radiosity.core.arrays import (
     ColorSums,
+    Distribution,
+    components,
     concat,
     lower_bound,
     lower_bound_within,
     opaque_index,
+    owned,
+    owned_vectors,
     power_of_two,
     totals,
     unique,
@@ -283,3 +287,98 @@ def test_power_of_two(value):
 @pytest.mark.parametrize("value, power", [(0, 1), (0.5, 1), (1, 2), (np.nextafter(1, 0), 1), (3, 4), (4, 8)])
 def test_powers_at_the_ends(value, power):
     assert power_of_two(value) == power
+
+
+# ---- Arrays from NumPy -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind, dtype", [("Float", np.float32), ("UInt32", np.uint32)])
+@pytest.mark.parametrize("n", [0, 1, 5, 1000])
+def test_owned_is_a_copy(kind, dtype, n):
+    """What happens to NumPy's memory afterwards does not show, whatever was array and however it lies there."""
+    for array in (np.arange(n), np.arange(2 * n)[::2] // 2, np.arange(n, dtype=dtype), np.arange(n, dtype=float)):
+        expected = array.astype(dtype)
+        copy = owned(getattr(mi, kind), array)
+        array[:] = 7
+        assert type(copy) is getattr(mi, kind) and dr.width(copy) == n
+        np.testing.assert_array_equal(np.array(copy), expected)
+
+
+@pytest.mark.parametrize("name", ["Point3f", "Vector3f", "Color3f"])
+def test_owned_vectors(name):
+    given = np.random.default_rng(2).normal(size=(50, 3))
+    vectors = owned_vectors(getattr(mi, name), given)
+    assert type(vectors) is getattr(mi, name)
+    np.testing.assert_array_equal(np.array(vectors).T, given.astype(np.float32))
+    assert dr.width(owned_vectors(getattr(mi, name), np.zeros((0, 3)))) == 0
+
+
+# ---- Distribution ----------------------------------------------------------------------------------
+
+
+@st.composite
+def weights(draw):
+    """Weights over twelve decades, some of them 0, not all."""
+    found = draw(st.lists(st.one_of(st.just(0.0), st.floats(1e-6, 1e6)), min_size=1, max_size=30))
+    found[draw(st.integers(0, len(found) - 1))] = draw(st.floats(1e-6, 1e6))
+    return np.array(found)
+
+
+@EXAMPLES
+@given(weights())
+def test_probabilities_are_those_of_the_weights(values):
+    d = Distribution(mi.Float64(values), values.sum())
+    found = np.array(d.probability(dr.arange(mi.UInt32, len(values))))
+    np.testing.assert_allclose(found, values / values.sum(), rtol=1e-12, atol=2.0**-44)
+    assert found.sum() == pytest.approx(1, rel=1e-14) and ((found == 0) == (values == 0)).all()
+
+
+@EXAMPLES
+@given(weights(), st.integers(0, 2**32 - 1))
+def test_positions_belong_to_the_number_that_covers_them(values, seed):
+    """Each number has [start, start + weight), from its first to its last position, and nothing else."""
+    d, k = Distribution(mi.Float64(values), values.sum()), dr.arange(mi.UInt32, len(values))
+    weight, start = np.array(d.weight), np.array(d.start(k))
+    assert weight.sum() == d.whole and (start == np.cumsum(weight) - weight).all()
+    some = np.flatnonzero(weight)
+    for position in (start[some], start[some] + weight[some] - 1):
+        np.testing.assert_array_equal(np.array(d.at(mi.Float64(position.astype(float)))), some)
+    position = np.floor(np.random.default_rng(seed).uniform(0, d.whole, 50))
+    expected = np.searchsorted(np.cumsum(weight), position, side="right")
+    np.testing.assert_array_equal(np.array(d.at(mi.Float64(position))), expected)
+
+
+def test_a_distribution_on_any_number_of_threads():
+    values, threads = np.random.default_rng(5).exponential(size=1 << 18), dr.thread_count()
+    found = []
+    try:
+        for count in (1, max(threads, 2)):
+            dr.set_thread_count(count)
+            found.append(np.array(Distribution(mi.Float64(values), values.sum()).cumulative))
+    finally:
+        dr.set_thread_count(threads)
+    np.testing.assert_array_equal(*found)
+
+
+# ---- components ------------------------------------------------------------------------------------
+
+
+@EXAMPLES
+@given(st.integers(1, 30), st.data())
+def test_components_are_those_of_scipy(count, data):
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    links = st.lists(st.tuples(st.integers(0, count - 1), st.integers(0, count - 1)), max_size=40)
+    a, b = np.array(data.draw(links), dtype=int).reshape(-1, 2).T
+    found = components(count, a, b)
+    _, expected = connected_components(coo_matrix((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
+    np.testing.assert_array_equal(found[:, None] == found, expected[:, None] == expected)
+
+
+def test_components_of_a_long_chain():
+    """The worst order for labels that travel along links."""
+    n = 2000
+    order = np.random.default_rng(4).permutation(n)
+    assert len(set(components(n, order[:-1], order[1:]).tolist())) == 1
+    assert len(set(components(n, np.array([], int), np.array([], int)).tolist())) == n

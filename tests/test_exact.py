@@ -76,7 +76,7 @@ def test_two_parallel_plates():
     """1.01021805506 and 0.100947189239 in the 99.9 % interval of eight seeds, no wider than 1e-4."""
     lit, other = [], []
     for seed in range(8):
-        values, areas, patches = leaf_values(mr.solve(squares(), mr.Uniform(), elements=512, rays=1_000_000, seed=seed))
+        values, areas, _ = leaf_values(mr.solve(squares(), mr.Uniform(), elements=512, rays=1_000_000, seed=seed))
         emits = values[:, 0] > 0.5
         lit.append(np.average(values[emits, 0], weights=areas[emits]))
         other.append(np.average(values[~emits, 0], weights=areas[~emits]))
@@ -126,7 +126,7 @@ def lambert(x, normal, triangles):
 
 @pytest.fixture(scope="session")
 def full_matrix(cornell):
-    """Mean B of every wall from a dense linear system of all cells, with Lambert's formula times visibility along lines."""
+    """Mean B of every wall from a dense linear system of all cells: Lambert's formula times visibility along lines."""
     model = Model(cornell)
 
     def grid(n):
@@ -192,7 +192,10 @@ def cornell_walls(cornell):
 
 
 def test_full_matrix_solution_of_the_cornell_box(full_matrix, cornell_walls):
-    """All walls within 1.5 % of a dense solver that shares nothing with ours; the sides of boxes, which its cells on the floor serve badly, within 5 %."""
+    """All walls within 1.5 % of a dense solver that shares nothing with ours.
+
+    The sides of boxes, which its cells on the floor serve badly, within 5 %.
+    """
     ours, model = cornell_walls
     walls, normal, area = names_of_walls(model), np.array(model.patches.normal).T, np.array(model.patches.area)
     assert set(ours) == set(full_matrix) == set(range(15))
@@ -203,7 +206,7 @@ def test_full_matrix_solution_of_the_cornell_box(full_matrix, cornell_walls):
 
 
 def path_means(model, samples=1 << 18):
-    """Mean B of every wall by Mitsuba's path integrator, looking at random points of patches from nearby, and its standard error."""
+    """Mean B of every wall by Mitsuba's path integrator, looking at random points nearby, and its standard error."""
     random = np.random.default_rng(0)
     area, walls = np.array(model.patches.area, dtype=float), names_of_walls(model)
     path, sampler, result = (
@@ -238,7 +241,10 @@ def test_path_agrees_on_every_wall(cornell_walls):
 
 
 def test_noise_falls_with_rays_and_mesh_error_with_elements():
-    """Noise of a furnace: slope −½ or steeper in rays. Elements of one value against the exact field: error ∝ h, slope −½ in elements."""
+    """Noise of a furnace: slope −½ or steeper in rays.
+
+    Elements of one value against the exact field: error ∝ h, slope −½ in elements.
+    """
     rays = 4 ** np.arange(4) * 20_000
     noise = [errors(mr.solve(furnace(0.5), mr.Uniform(), elements=768, rays=int(n)), 2) for n in rays]
     assert np.polyfit(np.log(rays), np.log(noise), 1)[0] < -0.5

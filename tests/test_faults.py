@@ -169,7 +169,7 @@ BOX = "scenes_xml/cornell_box.xml"
 
 @pytest.mark.parametrize("seconds", [0.2, 4.0])
 def test_a_real_interrupt(tmp_path, seconds):
-    """SIGINT while the scene loads and while rays are cast: exit status 130, one line, no traceback, nothing half-written."""
+    """SIGINT while the scene loads, and rays are cast: status 130, one line, no traceback, nothing half-written."""
     run = subprocess.Popen(
         [*CLI, "render", BOX, "-o", str(tmp_path / "x.exr"), "--rays", "2000000000"],
         stdout=subprocess.PIPE,

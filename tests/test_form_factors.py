@@ -68,7 +68,7 @@ def estimates(model, lines, seeds=SEEDS, first_seed=0):
     i, j = (np.ascontiguousarray(x.ravel()) for x in np.meshgrid(a, b, indexing="ij"))
     results = []
     for seed in range(first_seed, first_seed + seeds):
-        pairs = Pairs(Tree(model.patches, model.materials), model.rays, mr.GMI(), lines, seed)
+        pairs = Pairs(Tree(model.patches, model.materials, model.lights), model.rays, mr.GMI(), lines, seed)
         pairs.add_roots(mi.UInt32(i), mi.UInt32(j))
         F = np.array(
             pairs.kernel_samples(pairs.find_roots(mi.UInt32(i), mi.UInt32(j), dr.full(mi.Bool, True, len(i)))),
@@ -192,7 +192,7 @@ def test_touching_patches(degrees, h, w, exact):
     # At 1° a few lines next to the edge hold most of F: their mean is known to 11 % only.
     assert estimates(model, 40_000).mean() == pytest.approx(exact, rel=0.02 if degrees > 1 else 0.2)
     for oracle in (mr.KS(), mr.MI(), mr.GMI(0.5), mr.GMI(1.5), mr.GMI(3), mr.Power(), mr.Uniform()):
-        pairs = Pairs(Tree(model.patches, model.materials), model.rays, oracle, 10, 0)
+        pairs = Pairs(Tree(model.patches, model.materials, model.lights), model.rays, oracle, 10, 0)
         pairs.add_roots(mi.UInt32(group(model, A)), mi.UInt32(group(model, B)))
         pairs.evaluate(dr.arange(mi.UInt32, len(pairs) - 1) + 1)
         sigma = np.array(pairs.sigma[0])
@@ -233,7 +233,10 @@ def test_reciprocity():
 
 @pytest.mark.parametrize("oracle", [mr.GMI(0.5), mr.MI(), mr.GMI(1.5)], ids=str)
 def test_nothing_to_refine_inside_a_sphere(oracle):
-    """F is constant in a sphere, but for facets that touch: where a box of its area is split again and again, fewer than 1 % of 1,280 facets are."""
+    """F is constant in a sphere, but for facets that touch.
+
+    Where a box of its area is split again and again, fewer than 1 % of 1,280 facets are.
+    """
     vertices, faces = icosphere(3)
     ball = scene(ball=mesh(vertices, faces, diffuse(A), lamp()))
     side = (4 * np.pi / 6) ** 0.5

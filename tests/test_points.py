@@ -6,7 +6,16 @@ All seeds are fixed, so a test passes always or never; limits are those of a sta
 from itertools import combinations, product
 from statistics import NormalDist
 
-from mi_radiosity.core.points import STEPS, cosine_direction, hash_pair, kronecker, triangle
+from mi_radiosity.core.points import (
+    STEPS,
+    Stream,
+    cosine_direction,
+    hash_pair,
+    kronecker,
+    stream_seed,
+    triangle,
+    uniform,
+)
 
 import drjit as dr
 import mitsuba as mi
@@ -263,3 +272,54 @@ def test_keys_of_owners(count):
     np.testing.assert_array_equal(points(index, key, 8, owner), each)
     if count == 1:
         np.testing.assert_array_equal(points(index, key, 8), each)
+
+
+# ---- Streams ---------------------------------------------------------------------------------------
+
+
+def test_streams_do_not_collide():
+    """All streams, 64 numbers and 40 seeds, of either sign and beyond 32 bits, have seeds of their own."""
+    seeds = [*range(-8, 24), 1234, 10**6, 2**31 - 1, 2**31, 2**32 - 9, 99999, 424242, 2**24]
+    cases = list(product(seeds, Stream, range(64)))
+    found = {stream_seed(*case) for case in cases}
+    assert all(0 <= seed < 2**32 for seed in found)
+    # Of n random 32-bit numbers, n²/2³³ pairs are expected to be equal: 0.04 for these.
+    assert len(found) == len(cases)
+
+
+def test_a_seed_is_32_bits():
+    assert stream_seed(-1, Stream.POWER) == stream_seed(2**32 - 1, Stream.POWER)
+    assert stream_seed(2**32 + 5, Stream.PILOT, 3) == stream_seed(5, Stream.PILOT, 3)
+
+
+@pytest.mark.parametrize("what", ["seed", "stream", "number"])
+def test_neighbouring_streams_share_no_bits(what):
+    """Each of the 32 bits flips in half of the cases when seed, stream or number goes on by one."""
+    cases = range(2000)
+    if what == "stream":
+        pairs = [(stream_seed(k, a), stream_seed(k, b)) for k in cases for a, b in zip(Stream, list(Stream)[1:])]
+    else:
+        step = {"seed": lambda k: stream_seed(k, Stream.POWER), "number": lambda k: stream_seed(1, Stream.PILOT, k)}[
+            what
+        ]
+        pairs = [(step(k), step(k + 1)) for k in cases]
+    flips = np.array([[(a ^ b) >> bit & 1 for bit in range(32)] for a, b in pairs]).mean(axis=0)
+    assert np.abs(flips - 0.5).max() < sigmas(32) * 0.5 / len(pairs) ** 0.5
+
+
+def test_uniform_is_uniform():
+    """Over keys for a seed, and over seeds for a key: pairs of neighbours fill the square."""
+
+    def neighbours(n):
+        k = 2 * dr.arange(mi.UInt32, n)
+        return mi.Point2f(uniform(k, mi.UInt32(3)), uniform(k + 1, mi.UInt32(3)))
+
+    def seeds(n):
+        k = 2 * dr.arange(mi.UInt32, n)
+        return mi.Point2f(uniform(mi.UInt32(3), k), uniform(mi.UInt32(3), k + 1))
+
+    for sample in (neighbours, seeds):
+        ok, why = is_uniform(sample, 2)
+        assert ok, why
+    x = np.array(uniform(dr.arange(mi.UInt32, KEYS), mi.UInt32(0)))
+    assert x.min() >= 0 and x.max() < 1

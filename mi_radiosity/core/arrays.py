@@ -6,17 +6,19 @@ from collections.abc import Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 NONE = 0xFFFFFFFF  # "no patch", "no element", "no pair"
+DTYPES = {"Float": np.float32, "Float64": np.float64}
 WEIGHTS = 2.0**46  # resolution of a Distribution
 
 
-def owned(kind, array):
+def owned(kind: type, array: ArrayLike) -> "dr.ArrayBase":
     """A Dr.Jit array (mi.Float, mi.Float64 or mi.UInt32) with a copy of a NumPy array of one dimension.
 
     Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
     """
-    kept = np.ascontiguousarray(array, dtype={mi.Float: np.float32, mi.Float64: np.float64}.get(kind, np.uint32))
+    kept = np.array(array, dtype=DTYPES.get(kind.__name__, np.uint32), order="C")  # the copy is made later
     copy = dr.empty(kind, len(kept))
     if len(kept):
         dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))
@@ -24,7 +26,7 @@ def owned(kind, array):
     return copy
 
 
-def owned_vectors(kind, array):
+def owned_vectors(kind: type, array: ArrayLike) -> "dr.ArrayBase":
     """A Dr.Jit array of three-vectors (mi.Point3f, mi.Vector3f, mi.Color3f) from NumPy [n, 3]."""
     return kind(*(owned(mi.Float, column) for column in np.asarray(array).T))
 
@@ -133,28 +135,28 @@ class Distribution:
     In integers, so that it is the same on any number of threads. ``whole`` is their sum (Python int).
     """
 
-    def __init__(self, weights, total):
+    def __init__(self, weights: "mi.Float64", total: float) -> None:
         scale = dr.opaque(mi.Float64, WEIGHTS / power_of_two(total))
         self.weight = mi.UInt64(dr.ceil(weights * scale))
         self.cumulative = dr.cumsum(self.weight)
         dr.eval(self.cumulative, self.weight)
         self.whole = dr.gather(mi.UInt64, self.cumulative, dr.width(self.cumulative) - 1)[0]
 
-    def at(self, position):
+    def at(self, position: "mi.Float64") -> "mi.UInt32":
         """The number whose weight covers a position in [0, whole) (Float64 [m] ─► UInt32 [m])."""
         return lower_bound(self.cumulative, mi.UInt64(position) + 1)
 
-    def start(self, number):
+    def start(self, number: "mi.UInt32") -> "mi.Float64":
         """Where the weight of a number begins (Float64 [m])."""
         end, weight = dr.gather(mi.UInt64, self.cumulative, number), dr.gather(mi.UInt64, self.weight, number)
         return mi.Float64(end - weight)
 
-    def probability(self, number):
+    def probability(self, number: "mi.UInt32") -> "mi.Float64":
         """p(number) (Float64 [m])."""
         return mi.Float64(dr.gather(mi.UInt64, self.weight, number)) / dr.opaque(mi.Float64, self.whole)
 
 
-def components(count, a, b):
+def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Labels of ``count`` things, the same for those that links a[k], b[k] connect (int [count])."""
     label, before = np.arange(count), None
     while before is None or (label != before).any():

@@ -1,9 +1,12 @@
 """Parts that others add: classes known by a name, and the modules that define them."""
 
+import functools
 import importlib
 import importlib.metadata
 import runpy
+import warnings
 from pathlib import Path
+from typing import Any
 
 from .errors import RadiosityError
 
@@ -21,7 +24,7 @@ class Registry(dict):
         """Make a class known; a later one of the same name takes its place."""
         self[name] = cls
 
-    def find(self, name: str) -> type:
+    def find(self, name: str) -> Any:
         """The class of a name. Raises RadiosityError that lists the names there are."""
         if name not in self:
             raise RadiosityError(f"unknown {self.kind} '{name}': choose one of {', '.join(self)}")
@@ -54,3 +57,12 @@ def load_installed() -> None:
     """Run the plugins that installed packages declare."""
     for entry in importlib.metadata.entry_points(group=GROUP):
         load(entry.value)
+
+
+@functools.cache
+def welcome_installed() -> None:
+    """`load_installed`, once; one that fails is a warning, so that it does not keep others from their work."""
+    try:
+        load_installed()
+    except RadiosityError as error:
+        warnings.warn(str(error), stacklevel=2)

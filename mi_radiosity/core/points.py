@@ -24,10 +24,13 @@ class Stream(IntEnum):
     PAIRS = 1  # lines between the elements of a pair
     PILOT = 2  # rays that discover pairs; one stream each
     COVER = 3  # points that show what of a leaf is covered
-    STARVED = 4  # lines and rays of leaves that gather
+    GATHER = 4  # lines and rays of leaves that gather
     REACH = 5  # rays that look for light while a scene is read
     MEASURE = 6  # irradiance at points of the user's
-    FACTORS = 9  # rays and lines that view factors are made of
+    ALBEDO = 7  # directions that the albedo of a diffuse lobe is found with
+    PIXELS = 9  # camera samples
+    LOBES = 8  # what lobes rays draw on their way
+    FACTORS = 10  # rays and lines that view factors are made of
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

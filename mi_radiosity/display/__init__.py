@@ -1,8 +1,21 @@
-"""Radiosity shown: shadings by name, a continuous field over the mesh, and the `radiosity` integrator."""
+"""Radiosity shown: shadings by name, and the `radiosity` integrator."""
 
-from .field import Field
+from ..solver import Field
 from .image import write_image
 from .integrator import register, render
-from .shaders import SHADERS, Look, Shader
+from .lux import Lux, lux_scale
+from .shaders import SHADERS, Flat, Gouraud, Look, Shader
 
-__all__ = ["SHADERS", "Field", "Look", "Shader", "register", "render", "write_image"]
+__all__ = [
+    "SHADERS",
+    "Field",
+    "Flat",
+    "Gouraud",
+    "Look",
+    "Lux",
+    "Shader",
+    "lux_scale",
+    "register",
+    "render",
+    "write_image",
+]

@@ -1,6 +1,7 @@
 """Pictures on disk."""
 
 import json
+import os
 
 import mitsuba as mi
 import numpy as np
@@ -9,7 +10,7 @@ from ..core.errors import RadiosityError
 from ..core.files import writing
 
 
-def write_image(path, image, stats=None):
+def write_image(path: str | os.PathLike[str], image: "mi.TensorXf", stats: dict | None = None) -> None:
     """Write a picture (mi.TensorXf [height, width, channels]): EXR linear, with ``stats`` in its
     header; PNG as 8-bit sRGB. Raises RadiosityError if it cannot be written."""
     if not np.isfinite(np.array(image)).all():

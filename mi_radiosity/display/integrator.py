@@ -1,5 +1,7 @@
 """The `radiosity` integrator: any sensor looks at a solution through Mitsuba's own film."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -9,6 +11,7 @@ from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import Solution, solve
+from .pixels import picture
 from .shaders import SHADERS, Look
 
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
@@ -27,17 +30,16 @@ def _integrator_class():
         The scene is solved at its first picture and not again until it, or a parameter, changes.
         """
 
-        def __init__(self, props):
+        def __init__(self, props: "mi.Properties") -> None:
             super().__init__(props)
             self.shading = props.get("shading", "gouraud")
             SHADERS.find(self.shading)
             alpha = float(props.get("alpha")) if "alpha" in props else None
-            self.options = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
+            self.options: dict[str, Any] = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
             for name, kind in (("elements", int), ("epsilon", float), ("rays", int), ("lines", int), ("seed", int)):
                 if name in props:
                     self.options[name] = kind(props.get(name))
             self.progress = None
-            self._pixel = 1.0
             self._forget()
 
         def _forget(self):
@@ -54,6 +56,7 @@ def _integrator_class():
         def prepare(self, scene):
             """The solution of ``scene``, solved now if there is none, or if the scene has been edited since."""
             require_variant()
+            refuse_gradients(scene)
             if self.solution is not None and self.solution.model.state.same_as(scene):
                 return self.solution
             if self._given:
@@ -73,12 +76,10 @@ def _integrator_class():
             return self.render(scene, sensor, seed=seed, spp=spp)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            refuse_gradients(scene)
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            # Mitsuba shrinks ray differentials to the spacing of samples.
-            self._pixel = (spp or chosen.sampler().sample_count()) ** 0.5
-            return super().render(scene, chosen, seed, spp, develop, evaluate)
+            seed = int(seed[0] if dr.is_array_v(seed) else seed)
+            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self.sample, develop)
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)
@@ -88,15 +89,29 @@ def _integrator_class():
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             solution = self.prepare(scene)
-            rays = solution.model.rays
-            prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            hit = rays.locate(prelim, ray.d)
+            model, rays = solution.model, solution.model.rays
+            if rays.lobes is None:
+                prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+                hit = rays.locate(prelim, ray.d)
+            else:
+                number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
+                prelim, hit = None, rays.follow(ray.o, ray.d, number, seed, camera=True, active=active)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
-            reflectance = _reflectance(solution.model, prelim, ray, hit, lit)
-            look = Look(ray, hit, leaf, reflectance, lit, sampler, dr.opaque(mi.Float, self._pixel))
-            return dr.select(lit, self._shader.radiance(look), 0), valid, []
+            reflectance = _reflectance(model, prelim, ray, hit, lit)
+            emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
+            emission = model.lights.seen(model.patches, hit, emits)
+            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
+            radiance = dr.select(lit, self._shader.radiance(look), 0)
+            if model.lights.has_sky and not self.hide_emitters:
+                direction = ray.d if rays.lobes is None else hit.direction
+                radiance += model.lights.sky(direction, active & ~hit.valid) * dr.inv_pi
+                valid |= active
+            if rays.lobes is not None:
+                radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
+                valid |= active & hit.bounced
+            return radiance, valid, []
 
         def traverse(self, callback):
             pass
@@ -113,23 +128,29 @@ def _integrator_class():
 
 def _reflectance(model, prelim, ray, hit, lit):
     """ρ where camera rays meet patches (Color3f [rays])."""
+    traced = model.rays.lobes is not None
     if not model.materials.textured:
         return dr.gather(mi.Color3f, model.patches.reflectance, hit.patch, lit)
-    if not model.rays.overlaps:
+    if not model.rays.overlaps and not traced:
         si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, lit)
         return si.bsdf().eval_diffuse_reflectance(si, lit)
     # The face shown need not be the one the ray met.
     patch = dr.select(lit, hit.patch, 0)
     face, back = dr.gather(mi.UInt32, model.patches.face, patch), dr.gather(mi.Bool, model.patches.back, patch)
-    return model.materials.reflectance_at(face, hit.u, hit.v, back)
+    value = model.materials.reflectance_at(face, hit.u, hit.v, back)
+    if not traced:
+        return value
+    return dr.select(model.materials.is_traced(face), dr.gather(mi.Color3f, model.patches.reflectance, patch), value)
 
 
-def register(*_) -> None:
+def register(*_: object) -> None:
     """Make `radiosity` known to the active variant, and to those chosen later."""
     if mi.variant():
         mi.register_integrator("radiosity", lambda props: _integrator_class()(props))
 
 
-def render(solution: Solution, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+def render(
+    solution: Solution, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+) -> "mi.TensorXf":
     """Picture of ``solution`` from a sensor (or its number), [height, width, channels]."""
     return solution.render(sensor, spp=spp, shading=shading, seed=seed)

@@ -6,9 +6,10 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.plugins import Registry
+from ..core.points import cosine_direction
 from ..scene.rays import Hit
-from ..solver import Solution
-from .field import Field
+from ..solver import Field, Solution
+from ..transport import Places
 
 LINE_WIDTH = 1.0  # pixels
 LINE_SHADE = 0.25  # of the picture under an element outline
@@ -22,10 +23,10 @@ class Look:
     ray: "mi.RayDifferential3f"
     hit: Hit
     leaf: "mi.UInt32"  # the element at the hit
+    emission: "mi.Color3f"  # E at the hit, W/m²
     reflectance: "mi.Color3f"  # ρ at the hit, textures and all
     lit: "mi.Bool"  # the ray meets a patch; the others are black
     sampler: "mi.Sampler"
-    pixel: "mi.Float"  # width of a pixel in units of the ray differentials
 
 
 class Shader:
@@ -34,7 +35,7 @@ class Shader:
 
     name = ""
 
-    def __init_subclass__(cls, **options):
+    def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
         if "name" in vars(cls):
             SHADERS.add(cls.name, cls)
@@ -42,14 +43,18 @@ class Shader:
     def __init__(self, solution: Solution):
         self.solution = solution
 
+    @classmethod
+    def legend(cls, solution: Solution) -> str:
+        """What there is to know to read its pictures: one line, or nothing."""
+        return ""
+
     def irradiance(self, look: Look) -> "mi.Color3f":
         """H where rays meet patches, W/m² (Color3f [rays])."""
         raise NotImplementedError(f"{type(self).__name__} must define irradiance(look)")
 
     def radiance(self, look: Look) -> "mi.Color3f":
         """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays])."""
-        emission = dr.gather(mi.Color3f, self.solution.model.patches.emission, look.hit.patch, look.lit)
-        return (emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
+        return (look.emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
 
 
 class Gouraud(Shader):
@@ -57,11 +62,11 @@ class Gouraud(Shader):
 
     name = "gouraud"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
-        self.field = Field(solution)
+        self.field = solution.field
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return self.field.at(look.leaf, look.hit.u, look.hit.v, look.lit)
 
 
@@ -70,11 +75,11 @@ class Flat(Shader):
 
     name = "flat"
 
-    def __init__(self, solution):
+    def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._irradiance = solution.irradiance()
 
-    def irradiance(self, look):
+    def irradiance(self, look: Look) -> "mi.Color3f":
         return dr.gather(mi.Color3f, self._irradiance, look.leaf, look.lit)
 
 
@@ -83,7 +88,7 @@ class Mesh(Gouraud):
 
     name = "mesh"
 
-    def radiance(self, look):
+    def radiance(self, look: Look) -> "mi.Color3f":
         return super().radiance(look) * dr.select(self._on_outline(look), LINE_SHADE, 1)
 
     def _on_outline(self, look):
@@ -104,5 +109,55 @@ class Mesh(Gouraud):
 
         here = local(ray.o, ray.d)
         dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
-        per_pixel = dr.sqrt(dx * dx + dy * dy) * look.pixel
+        per_pixel = dr.sqrt(dx * dx + dy * dy)
         return look.lit & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
+
+
+class Gather(Shader):
+    """Light gathered at every pixel: one line to the lamps and one ray into the solved room per sample, by multiple
+    importance. As sharp as path tracing, whose paths it ends at their second diffuse lobe."""
+
+    name = "gather"
+
+    def __init__(self, solution: Solution) -> None:
+        super().__init__(solution)
+        self._gatherer = solution.gatherer()
+
+    def irradiance(self, look: Look) -> "mi.Color3f":
+        lamps, room = self._samples(look)
+        return lamps + room
+
+    def _samples(self, look):
+        """H from the lamps and from the room, a sample of each (two Color3f [rays])."""
+        places, sampler = self._places(look), look.sampler
+        lot, at, to = sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+        number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
+        direction = cosine_direction(places.normal, to.x, to.y)
+        side = dr.gather(mi.Vector3f, self.solution.model.patches.normal, look.hit.patch, look.lit)
+        above = look.lit & (dr.dot(direction, side) > 0)
+        lines = self._gatherer.lines(places, lot, at.x, at.y, 1.0, look.lit)
+        room, met = self._gatherer.rays(places, direction, number, seed, 1.0, above)
+        return lines + met, room
+
+    def _places(self, look):
+        model = self.solution.model
+        patches, hit = model.patches, look.hit
+        patch = dr.select(look.lit, hit.patch, 0)
+        normal = dr.gather(mi.Vector3f, patches.normal, patch)
+        if model.faces.smooth:
+            face, back = dr.gather(mi.UInt32, patches.face, patch), dr.gather(mi.Bool, patches.back, patch)
+            normal = mi.Vector3f(model.faces.surface(face, hit.u, hit.v).sh_frame.n) * dr.select(back, -1, 1)
+        return Places(patches.point(patch, hit.u, hit.v), normal, dr.select(look.lit, look.leaf, 0))
+
+
+class Direct(Gather):
+    """Light of the lamps gathered at every pixel, the rest from the continuous field."""
+
+    name = "direct"
+
+    def __init__(self, solution: Solution) -> None:
+        super().__init__(solution)
+        self._field = Field(solution, solution.indirect)
+
+    def irradiance(self, look: Look) -> "mi.Color3f":
+        return self._samples(look)[0] + self._field.at(look.leaf, look.hit.u, look.hit.v, look.lit)

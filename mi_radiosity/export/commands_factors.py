@@ -2,14 +2,26 @@
 
 import argparse
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import RadiosityError
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-def view_factors_arguments(parser: argparse.ArgumentParser) -> None:
+ProgressBars = Callable[[], AbstractContextManager]
+
+
+def add_view_factors(
+    commands: Any, scene_arguments: Callable[[argparse.ArgumentParser], None], progress_bars: ProgressBars
+) -> None:
+    """Add the command to ``commands``; ``scene_arguments`` adds those that say which scene and how it is loaded."""
+    parser = commands.add_parser("view-factors", help="view factors between shapes or faces, as a sparse matrix")
+    scene_arguments(parser)
     add = parser.add_argument
     files = "sparse matrix; beside .csv and .mtx, OUT_facets.csv names the facets"
     add("-o", "--output", required=True, type=Path, metavar="OUT.npz|.csv|.mtx", help=files)
@@ -17,10 +29,11 @@ def view_factors_arguments(parser: argparse.ArgumentParser) -> None:
     add("--rays", type=int, metavar="N", help="rays from every row (default 1,024; 131,072 from shapes)")
     add("--up", default="z", metavar="x|y|z", help="axis towards the sky (default z); -x, -y, -z as --up=-z")
     add("--seed", type=int, default=0, metavar="K", help="random seed (default 0)")
+    parser.set_defaults(command=partial(_view_factors, progress_bars=progress_bars))
 
 
-def view_factors(arguments: argparse.Namespace) -> None:
-    """View factors between the shapes or faces of a scene, which needs no lamp."""
+def _view_factors(arguments: argparse.Namespace, progress_bars: ProgressBars) -> None:
+    """Compute, write, and print what closing has changed."""
     from ..scene import Model
     from ..transport import view_factors
     from .factors import check_factors_path, write_factors
@@ -30,7 +43,7 @@ def view_factors(arguments: argparse.Namespace) -> None:
     model = Model(arguments.file.load(), lit=False)
     for warning in model.warnings:
         print(f"mi-radiosity: warning: {warning}", file=sys.stderr)
-    with arguments.progress_bars() as report:
+    with progress_bars() as report:
         factors = view_factors(model, arguments.level, arguments.rays, seed=arguments.seed, up=up, progress=report)
         write_factors(factors, arguments.output, lambda done, total: report("write", done, total))
     c, s, (rows, columns) = factors.closure, factors.stats, factors.F.shape

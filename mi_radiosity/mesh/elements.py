@@ -7,6 +7,9 @@ import mitsuba as mi
 
 from ..core.arrays import concat, opaque_index
 from ..core.points import hash_pair
+from ..scene.lights import Lights
+from ..scene.materials import Materials
+from ..scene.patches import Patches
 from .subdivision import child_at, child_frame
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
@@ -22,9 +25,11 @@ class Elements:
     Arrays over elements: ``patch``, ``parent`` (its own number for roots), ``child`` (first of four
     children, 0 for leaves; UInt32), ``place`` (UInt32, where in its patch: the child numbers on the
     way down, two bits each from the top, then the level), ``u0``, ``v0``, ``scale``, ``area`` (Float, m²) and
-    ``reflectance`` (Color3f, the mean over the element). `Tree` grows; what its `freeze` returns never changes.
+    ``reflectance`` (Color3f, the mean over the element). ``exitance`` (Color3f, the same of E) is there only in scenes
+    with textured lamps, None in others. `Tree` grows; what its `freeze` returns never changes.
     """
 
+    patches: Patches
     patch: "mi.UInt32"
     parent: "mi.UInt32"
     child: "mi.UInt32"
@@ -34,63 +39,67 @@ class Elements:
     scale: "mi.Float"
     area: "mi.Float"
     reflectance: "mi.Color3f"
+    exitance: "mi.Color3f | None"
 
-    def __init__(self, patches, arrays):
-        self.patches = patches
-        for name in ARRAYS:
-            setattr(self, name, arrays[name])
+    def __init__(
+        self, patches: Patches, arrays: "dict[str, dr.ArrayBase]", exitance: "mi.Color3f | None" = None
+    ) -> None:
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return dr.width(self.patch)
 
-    def __setattr__(self, name, value):
-        if "_frozen" in vars(self):
-            raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
-        super().__setattr__(name, value)
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError("a frozen mesh does not change: split its tree and freeze it again")
 
     @cached_property
-    def leaves(self):
+    def leaves(self) -> "mi.UInt32":
         """Numbers of the leaves (UInt32 [leaves]), neighbours after neighbours, whichever was split first."""
         leaves = dr.compress(self.child == 0)
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
 
-    def with_patches(self, patches) -> "Elements":
-        """The same elements, frozen, of patches that differ in their light only."""
-        self.leaves  # noqa: B018  sorted once for all
-        other = object.__new__(Elements)
-        other.__dict__.update(self.__dict__ | {"patches": patches})
+    def with_light(self, patches: Patches, exitance: "mi.Color3f | None") -> "Elements":
+        """The same elements of patches that differ in their emission only."""
+        other = Elements(patches, {name: getattr(self, name) for name in ARRAYS}, exitance)
+        vars(other)["leaves"] = self.leaves  # sorted once for all
         return other
 
-    def level(self, element):
+    def level(self, element: "mi.UInt32") -> "mi.UInt32":
         """How often the patch was split (UInt32 [n])."""
         return dr.gather(mi.UInt32, self.place, element) & 15
 
-    def key(self, element):
+    def key(self, element: "mi.UInt32") -> "mi.UInt32":
         """What random numbers of elements are drawn by: the same whatever else was split (UInt32 [n])."""
         return hash_pair(dr.gather(mi.UInt32, self.patch, element), dr.gather(mi.UInt32, self.place, element))
 
-    def emission(self, element):
-        """E (Color3f [n])."""
+    def emission(self, element: "mi.UInt32") -> "mi.Color3f":
+        """E, the mean over elements (Color3f [n])."""
+        if self.exitance is not None:
+            return dr.gather(mi.Color3f, self.exitance, element)
         return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
-    def patch_point(self, element, a, b):
+    def patch_point(self, element: "mi.UInt32", a: "mi.Float", b: "mi.Float") -> "tuple[mi.Float, mi.Float]":
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
         scale = dr.gather(mi.Float, self.scale, element)
         return dr.gather(mi.Float, self.u0, element) + scale * a, dr.gather(mi.Float, self.v0, element) + scale * b
 
-    def own_point(self, element, u, v, active=True):
+    def own_point(
+        self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Float, mi.Float]":
         """The element's own coordinates (a, b) of the patch point (u, v)."""
         scale = dr.select(active, dr.gather(mi.Float, self.scale, element, active), 1)
         a = (u - dr.gather(mi.Float, self.u0, element, active)) / scale
         return a, (v - dr.gather(mi.Float, self.v0, element, active)) / scale
 
-    def locate(self, element, u, v):
+    def locate(self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.UInt32":
         """Child number 0…3 of ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         return child_at(*self.own_point(element, u, v))
 
     @dr.syntax
-    def leaf_at(self, element, u, v, active=True):
+    def leaf_at(
+        self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.UInt32":
         """The leaf below ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         element = mi.UInt32(element)
         child = dr.gather(mi.UInt32, self.child, element, active)
@@ -103,28 +112,31 @@ class Elements:
 class Tree(Elements):
     """Elements that still split. ``leaf_count`` is the number of leaves."""
 
-    def __init__(self, patches, materials):
+    __setattr__ = object.__setattr__  # type: ignore[assignment]
+
+    def __init__(self, patches: Patches, materials: Materials, lights: Lights) -> None:
         n = patches.count
         every = dr.arange(mi.UInt32, n)
         zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
         arrays = (every, every, zero, zero, nought, nought, dr.full(mi.Float, 1, n), patches.area, patches.reflectance)
         super().__init__(patches, {name: type(array)(array) for name, array in zip(ARRAYS, arrays)})
-        self._materials, self.leaf_count = materials, n
+        self._materials, self._lights, self.leaf_count = materials, lights, n
+        if lights.textured:
+            self.exitance = mi.Color3f(patches.emission)
 
     @property
-    def leaves(self):
+    def leaves(self) -> "mi.UInt32":
         raise AttributeError("a tree still grows: freeze it first")
 
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
-        elements = Elements(self.patches, {name: type(value)(value) for name, value in self._arrays().items()})
-        elements._frozen = True
-        return elements
+        arrays = {name: type(value)(value) for name, value in self._arrays().items()}
+        return Elements(self.patches, arrays, None if self.exitance is None else mi.Color3f(self.exitance))
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
 
-    def split(self, chosen):
+    def split(self, chosen: "mi.UInt32") -> None:
         """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
         count = dr.width(chosen)
         if count == 0:
@@ -135,6 +147,9 @@ class Tree(Elements):
         new = self._children(dr.gather(mi.UInt32, chosen, k // 4), k % 4)
         for name in ARRAYS:
             setattr(self, name, concat(getattr(self, name), new[name]))
+        if self._lights.textured:
+            frame = (new[name] for name in ("patch", "u0", "v0", "scale"))
+            self.exitance = concat(self.exitance, mean_exitance(self.patches, self._lights, *frame))
         self.leaf_count += 3 * count
         dr.eval(*self._arrays().values())
 
@@ -163,4 +178,21 @@ class Tree(Elements):
         total = mi.Color3f(0)
         for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
             total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
-        return total / 4
+        # Where other lobes are traced, ρ is one number per patch.
+        return dr.select(
+            self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
+        )
+
+
+def mean_exitance(
+    patches: Patches, lights: Lights, patch: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
+) -> "mi.Color3f":
+    """E averaged over triangles (u0 + scale a, v0 + scale b) of patches (Color3f [n])."""
+    exitance = dr.zeros(mi.Color3f, dr.width(patch))
+    shining = dr.compress(dr.max(dr.gather(mi.Color3f, patches.emission, patch)) > 0)
+    if dr.width(shining):
+        patch, u0, v0, scale = (dr.gather(type(x), x, shining) for x in (patch, u0, v0, scale))
+        mean = lights.mean_exitance(dr.gather(mi.UInt32, patches.face, patch), u0, v0, scale)
+        dr.scatter(exitance, mean, shining)
+    dr.eval(exitance)
+    return exitance

@@ -7,6 +7,8 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, opaque_index
 from ..core.points import Stream, cosine_direction, kronecker, stream_seed, triangle
+from ..scene.rays import Rays
+from .elements import Elements
 from .hierarchy import mark, sum_up
 from .subdivision import NODES
 
@@ -33,13 +35,13 @@ class Exposure:
     slots: int
 
     @staticmethod
-    def unseen(elements) -> "Exposure":
+    def unseen(elements: Elements) -> "Exposure":
         """As if nothing were covered or crossed: what a pilot assumes."""
         n = len(elements)
         return Exposure(elements.area, dr.zeros(mi.Bool, n), dr.full(mi.UInt32, NONE, n), 0)
 
     @staticmethod
-    def of(elements, rays, seed) -> "Exposure":
+    def of(elements: Elements, rays: Rays, seed: int) -> "Exposure":
         """Look at every leaf."""
         crossed = _crossed_leaves(elements, rays)
         slot = dr.full(mi.UInt32, NONE, len(elements))
@@ -47,7 +49,7 @@ class Exposure:
             dr.scatter(slot, dr.arange(mi.UInt32, dr.width(crossed)), crossed)
         return Exposure(_open_area(elements, rays, seed), mark(elements, crossed), slot, dr.width(crossed))
 
-    def open_share(self, elements, element):
+    def open_share(self, elements: Elements, element: "mi.UInt32") -> "mi.Float":
         """The part of elements that is open (Float [n])."""
         return dr.gather(mi.Float, self.open_area, element) / dr.gather(mi.Float, elements.area, element)
 
@@ -77,7 +79,15 @@ def _covered_share(elements, rays, leaves, points, seed):
     return mi.Float(dr.block_sum(dr.select(covered, mi.UInt32(1), 0), points)) / mi.Float(each)
 
 
-def is_covered(elements, rays, leaf, u, v, s=0.3, t=0.6):
+def is_covered(
+    elements: Elements,
+    rays: Rays,
+    leaf: "mi.UInt32",
+    u: "mi.Float",
+    v: "mi.Float",
+    s: "mi.Float | float" = 0.3,
+    t: "mi.Float | float" = 0.6,
+) -> "mi.Bool":
     """Are patch points (u, v) of leaves covered (Bool [n])? s, t: two numbers that say where rays look.
 
     Inside of a solid, rays along the normal and in two more directions all meet sides that take no part in light
@@ -90,7 +100,7 @@ def is_covered(elements, rays, leaf, u, v, s=0.3, t=0.6):
 
     def inside(direction, active):
         hit = rays.trace(origin, direction, active)
-        return active & hit.valid & (hit.patch == NONE)
+        return active & hit.valid & (hit.patch == NONE) & ~hit.traced
 
     return inside(other, inside(aside, inside(normal, ~lamp))) | ~rays.on_top(patch, u, v)
 
@@ -105,7 +115,7 @@ def _crossed_leaves(elements, rays):
     return dr.gather(mi.UInt32, leaves, dr.compress(crossed))
 
 
-def node_point(elements, element, node):
+def node_point(elements: Elements, element: "mi.UInt32", node: int) -> "mi.Point3f":
     """Where a node of elements is, just inside of them and above their patch (Point3f [n])."""
     u, v = elements.patch_point(element, *((1 - TUCK) * x + TUCK / 3 for x in NODES[node]))
     return elements.patches.above(dr.gather(mi.UInt32, elements.patch, element), u, v)

@@ -1,12 +1,24 @@
 """Push and pull: values of leaves and of the elements above them."""
 
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import ColorSums, totals
+from .elements import Elements
 
 
-def climb(elements, element, visit, *state):
+class Sums(Protocol):
+    """Sums by element: a Tally, or ColorSums."""
+
+    def gather(self, index: "mi.UInt32") -> "list[mi.Float64]":
+        """The sums of elements (3 Float64 [n])."""
+        ...
+
+
+def climb(elements: Elements, element: "mi.UInt32", visit: Callable, *state: "dr.ArrayBase") -> tuple:
     """state = visit(element, active, *state) for elements (UInt32 [n]) and all their ancestors; returns it.
 
     ``active`` says which of the n are still on their way (Bool).
@@ -23,7 +35,7 @@ def climb(elements, element, visit, *state):
     return dr.while_loop(start, lambda element, active, *state: active, step)[2:]
 
 
-def push(elements, sums, leaves, area):
+def push(elements: Elements, sums: Sums, leaves: "mi.UInt32", area: "mi.Float") -> "list[mi.Float64]":
     """What leaves and their ancestors received, over their ``area`` (Float [elements]): 3 Float64 [leaves]."""
 
     def add(element, active, *total):
@@ -33,7 +45,7 @@ def push(elements, sums, leaves, area):
     return list(climb(elements, leaves, add, *(dr.zeros(mi.Float64, dr.width(leaves)) for _ in range(3))))
 
 
-def pull(elements, values, area):
+def pull(elements: Elements, values: "Sequence[mi.Float64]", area: "mi.Float") -> "mi.Color3f":
     """Area averages, for all elements, of values of the leaves (3 Float64 [leaves] ─► Color3f [elements]).
 
     area: Float [elements], additive: an element's is the sum of its children's.
@@ -46,7 +58,7 @@ def pull(elements, values, area):
     return result
 
 
-def sum_up(elements, values, bound):
+def sum_up(elements: Elements, values: "Sequence[mi.Float64]", bound: Sequence[float]) -> ColorSums:
     """Sums of values of the leaves (3 Float64 [leaves]) over all elements, as ColorSums."""
     sums = ColorSums(len(elements), bound)
 
@@ -58,7 +70,7 @@ def sum_up(elements, values, bound):
     return sums
 
 
-def mark(elements, chosen):
+def mark(elements: Elements, chosen: "mi.UInt32") -> "mi.Bool":
     """Which elements are ``chosen`` (UInt32 [n]) or above one of them (Bool [elements])?"""
     marks = dr.zeros(mi.Bool, len(elements))
 

@@ -7,8 +7,9 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, concat, lower_bound, lower_bound_within, opaque_index, unique
 from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
-from ..oracles import KernelSamples, Pair
-from .elements import MAX_LEVEL
+from ..oracles import KernelSamples, Oracle, Pair
+from ..scene.rays import Rays
+from .elements import MAX_LEVEL, Elements
 
 BATCH = 1 << 18  # pairs sampled in one launch: bounds memory
 ARRAYS = ("receiver", "source", "child", "halved", "asked", "occluded")
@@ -27,7 +28,7 @@ class Pairs:
     ``evaluated`` counts the pairs the oracle has seen.
     """
 
-    def __init__(self, elements, rays, oracle, lines, seed):
+    def __init__(self, elements: Elements, rays: Rays, oracle: Oracle, lines: int, seed: int) -> None:
         self.elements, self.rays, self.oracle, self.lines = elements, rays, oracle, lines
         self._seed = opaque_index(stream_seed(seed, Stream.PAIRS))
         self._root_keys = mi.UInt64(0xFFFFFFFFFFFFFFFF)  # a sentinel, so that the table is never empty
@@ -39,10 +40,10 @@ class Pairs:
         self.sigma: list = []
         self.evaluated = 0
 
-    def __len__(self):
+    def __len__(self) -> int:
         return dr.width(self.receiver)
 
-    def freeze(self, elements) -> "Pairs":
+    def freeze(self, elements: Elements) -> "Pairs":
         """The pairs as they are now, between frozen elements."""
         frozen = object.__new__(Pairs)
         frozen.__dict__.update(self.__dict__)
@@ -67,14 +68,14 @@ class Pairs:
 
     # ---- Finding pairs -------------------------------------------------------------------------
 
-    def find_roots(self, i, j, active=True):
+    def find_roots(self, i: "mi.UInt32", j: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.UInt32":
         """Numbers of the root pairs of patches (i, j), NONE where there is none yet (UInt32 [n])."""
         first, last = dr.gather(mi.UInt32, self._row, i, active), dr.gather(mi.UInt32, self._row, i + 1, active)
         at = lower_bound_within(self._sources, j, first, last, active)
         found = active & (at < last) & (dr.gather(mi.UInt32, self._sources, at, active) == j)
         return dr.select(found, dr.gather(mi.UInt32, self._roots, at, found), NONE)
 
-    def add_roots(self, i, j):
+    def add_roots(self, i: "mi.UInt32", j: "mi.UInt32") -> None:
         """Make root pairs of patches (i, j) that have none (UInt32 [n], repetitions allowed)."""
         if dr.width(i) == 0:
             return
@@ -95,7 +96,15 @@ class Pairs:
         dr.eval(self._sources, self._row)
 
     @dr.syntax
-    def descend(self, pair, ui, vi, uj, vj, active=True):
+    def descend(
+        self,
+        pair: "mi.UInt32",
+        ui: "mi.Float",
+        vi: "mi.Float",
+        uj: "mi.Float",
+        vj: "mi.Float",
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.UInt32":
         """Follow points (ui, vi) of receivers and (uj, vj) of sources down to pairs without children."""
         pair = mi.UInt32(pair)
         child = dr.gather(mi.UInt32, self.child, pair, active)
@@ -109,7 +118,7 @@ class Pairs:
 
     # ---- Asking the oracle ---------------------------------------------------------------------
 
-    def evaluate(self, pairs):
+    def evaluate(self, pairs: "mi.UInt32") -> None:
         """Ask the oracle for σ of ``pairs`` (UInt32 [n], none evaluated before)."""
         n = dr.width(pairs)
         for start in range(0, n, BATCH):
@@ -133,7 +142,7 @@ class Pairs:
         dr.scatter(self.asked, True, pairs)
         dr.eval(self.sigma, self.occluded, self.asked)
 
-    def kernel_samples(self, pairs):
+    def kernel_samples(self, pairs: "mi.UInt32") -> "mi.Float":
         """F along S lines of each pair, stratified in all four dimensions (Float [pairs · lines])."""
         e, lines = self.elements, dr.opaque(mi.UInt32, self.lines)
         k = dr.arange(mi.UInt32, dr.width(pairs) * self.lines)
@@ -144,7 +153,7 @@ class Pairs:
         x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
         return self.rays.kernel(dr.gather(mi.UInt32, e.patch, i), *x, dr.gather(mi.UInt32, e.patch, j), *y)
 
-    def describe(self, pairs, radiosity=None) -> Pair:
+    def describe(self, pairs: "mi.UInt32", radiosity: "mi.Color3f | None" = None) -> Pair:
         """Pairs as the oracle sees them; with ``radiosity`` B (Color3f [elements]) as its rule of acceptance does."""
         e = self.elements
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
@@ -155,7 +164,7 @@ class Pairs:
         rho, B = dr.gather(mi.Color3f, e.reflectance, i), dr.gather(mi.Color3f, radiosity, j)
         return dataclasses.replace(pair, rho=rho, B=B)
 
-    def value(self, pairs, radiosity):
+    def value(self, pairs: "mi.UInt32", radiosity: "mi.Color3f") -> "mi.Float":
         """What the oracle compares with ε, for pairs it has evaluated (Float [n], ≥ 0)."""
         sigma = [dr.gather(mi.Float, s, pairs) for s in self.sigma]
         value = self.oracle.value(sigma[0] if len(sigma) == 1 else tuple(sigma), self.describe(pairs, radiosity))
@@ -163,7 +172,7 @@ class Pairs:
 
     # ---- Splitting -----------------------------------------------------------------------------
 
-    def larger(self, pairs):
+    def larger(self, pairs: "mi.UInt32") -> "mi.UInt32":
         """The element that splits when a pair is rejected: the larger of two (UInt32 [n], NONE if it cannot)."""
         e = self.elements
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
@@ -171,7 +180,7 @@ class Pairs:
         larger_i = dr.gather(mi.Float, e.area, i) >= dr.gather(mi.Float, e.area, j)
         return dr.select(free_i & (larger_i | ~free_j), i, dr.select(free_j, j, NONE))
 
-    def split(self, chosen, element):
+    def split(self, chosen: "mi.UInt32", element: "mi.UInt32") -> None:
         """Give the pairs ``chosen`` (UInt32 [n]) the four children of their ``element`` (UInt32 [n])."""
         count = dr.width(chosen)
         if count == 0:

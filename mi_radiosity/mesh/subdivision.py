@@ -15,13 +15,15 @@ CHILD_CORNERS = ((0, 5, 4), (5, 1, 3), (4, 3, 2), (3, 4, 5))
 HALF_SIDES = ((0, 5), (5, 1), (1, 3), (3, 2), (2, 4), (4, 0))
 
 
-def child_at(a, b):
+def child_at(a: "mi.Float", b: "mi.Float") -> "mi.UInt32":
     """Which child holds a point (a, b) of an element (UInt32 [n])."""
     outer = dr.select(b >= 0.5, mi.UInt32(2), dr.select(a + b <= 0.5, mi.UInt32(0), mi.UInt32(3)))
     return dr.select(a >= 0.5, mi.UInt32(1), outer)
 
 
-def child_frame(which, u0, v0, scale):
+def child_frame(
+    which: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
+) -> "tuple[mi.Float, mi.Float, mi.Float]":
     """Origin and scale (u₀, v₀, s) of the child of a number in its parent's patch, from the parent's."""
     half = 0.5 * scale
     u0 = u0 + dr.select((which == 1) | (which == 3), half, 0)
@@ -29,7 +31,7 @@ def child_frame(which, u0, v0, scale):
     return u0, v0, dr.select(which == 3, -half, half)
 
 
-def child_point(which, a, b):
+def child_point(which: "mi.UInt32", a: "mi.Float", b: "mi.Float") -> "tuple[mi.Float, mi.Float]":
     """Own coordinates in the child of a point (a, b) of its parent (two Float [n])."""
     middle = which == 3
     a = dr.select(middle, 1 - 2 * a, 2 * a - dr.select(which == 1, 1.0, 0.0))
@@ -37,7 +39,7 @@ def child_point(which, a, b):
     return a, b
 
 
-def child_corner(which, corner):
+def child_corner(which: "mi.UInt32", corner: int) -> "mi.UInt32":
     """The parent's node that is a corner of the child of a number (UInt32 [n])."""
     node = mi.UInt32(CHILD_CORNERS[3][corner])
     for child in range(3):

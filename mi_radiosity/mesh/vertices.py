@@ -1,11 +1,15 @@
 """Vertices of a mesh: corners that elements share, and hanging ones in the middle of sides."""
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, concat, lower_bound, opaque_index, unique
 from ..core.points import ROUNDS
+from ..scene import Model
 from ..scene.patches import CORNERS
+from .elements import Elements
 from .exposure import node_point
 from .subdivision import CHILD_CORNERS
 
@@ -25,13 +29,13 @@ class Vertices:
     coarse ones first. ``point`` (Point3f [count]): where they are, just inside of the first element that has them.
     """
 
-    def __init__(self, model, elements):
+    def __init__(self, model: Model, elements: Elements) -> None:
         self._elements = elements
         n, roots = len(elements), elements.patches.count
         vertex, self.count = _weld(model)
         self.corner = [dr.full(mi.UInt32, NONE, n) for _ in range(3)]
         self.middle = [dr.full(mi.UInt32, NONE, n) for _ in range(3)]
-        self.straight = []
+        self.straight: list[tuple] = []
         level = dr.arange(mi.UInt32, roots)
         for corner, ids in zip(self.corner, vertex):
             dr.scatter(corner, ids, level)
@@ -73,8 +77,8 @@ class Vertices:
         return self._number_children(dr.gather(mi.UInt32, child, parents), corner, middle, parents), held
 
     def _hold(self, table, held, leaf, middle, sides):
-        """Note which of the new vertices, on sides ``table``, must stay half-way between the ends of their side; returns
-        the sides to be held at the next level: halves of held ones, and halves of bent sides of leaves."""
+        """Note which of the new vertices, on sides ``table``, must stay half-way between the ends of their side;
+        returns the sides to be held at the next level: halves of held ones, and halves of bent sides of leaves."""
         number = opaque_index(self.count) + dr.arange(mi.UInt32, dr.width(table))
         halves = []
         on_held = dr.compress(dr.gather(mi.UInt64, held, lower_bound(held, table)) == table)
@@ -101,7 +105,7 @@ class Vertices:
         j = dr.arange(mi.UInt32, 4 * dr.width(parents))
         return dr.gather(mi.UInt32, child, j // 4) + j % 4
 
-    def nodes(self, table, between):
+    def nodes(self, table: "dr.ArrayBase", between: Callable) -> "list[dr.ArrayBase]":
         """What ``table`` [vertices] says of the six nodes of the leaves (six of its kind [leaves]).
 
         Middles of sides that do not bend have no vertex: ``between(low, high, active)`` tells of them.

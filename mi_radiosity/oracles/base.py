@@ -92,7 +92,9 @@ class Oracle:
         return sigma * dr.max(pair.rho * pair.B)
 
     def __str__(self) -> str:
-        return self.name
+        """NAME, or NAME:PARAMETER if the first argument of the constructor is kept by its name."""
+        value = next((getattr(self, p, None) for p in inspect.signature(type(self)).parameters), None)
+        return f"{self.name}:{value:g}" if isinstance(value, (int, float)) else self.name
 
 
 def parse(text: str) -> Oracle:

@@ -108,9 +108,6 @@ class GMI(Oracle):
         scale = dr.opaque(mi.Float64, pair.total_area ** (self.alpha - 2))
         return pair.area_receiver * pair.area_source * scale * information_gap(samples, self.alpha)
 
-    def __str__(self) -> str:
-        return f"{self.name}:{self.alpha:g}"
-
 
 @dataclass(frozen=True)
 class MI(GMI):
@@ -122,6 +119,3 @@ class MI(GMI):
 
     alpha: float = field(default=1.0, init=False)
     name = "mi"
-
-    def __str__(self) -> str:
-        return self.name

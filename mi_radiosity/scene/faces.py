@@ -3,10 +3,11 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..core.arrays import owned
 from ..core.errors import RadiosityError
-from .tessellate import as_mesh, label
+from .tessellate import tracing_scene
 
 FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 
@@ -14,23 +15,26 @@ FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 class Faces:
     """Geometry of every face of a scene, in Mitsuba's order, which a ray's hit names it by.
 
-    ``tracing``: the scene itself, or one in which every shape is a mesh. Arrays over faces: ``corners``
-    [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m², ``shape`` (its
-    number), ``degenerate``, ``flipped`` (the shading side is not that of the order of corners) and ``rank`` (its
-    place in an order that only geometry decides); ``centre`` [3] of the scene.
+    ``tracing``: the scene itself, or one in which every shape is a mesh; ``parts``: what its shapes stand for. Arrays
+    over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
+    ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
+    corners) and ``rank`` (its place in an order that only geometry decides); ``centre`` [3] of the
+    scene; ``smooth``: some shapes have vertex normals.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
 
-    def __init__(self, scene):
-        self.scene, self.warnings = scene, []
+    def __init__(self, scene: "mi.Scene") -> None:
+        self.scene = scene
+        self.warnings: list[str] = []
         if not scene.shapes():
             raise RadiosityError("the scene has no shapes: nothing can be lit")
-        self.tracing = _tracing_scene(scene)
+        self.tracing, self.parts = tracing_scene(scene)
+        self.smooth = any(mesh.has_vertex_normals() for mesh in self.tracing.shapes())
         self._read(*_corners(self.tracing))
         self._orient()
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.shape)
 
     def _read(self, corners, counts):
@@ -65,7 +69,7 @@ class Faces:
         self.flipped = (shading * self.normal).sum(axis=1) < 0
         self.normal[self.flipped] *= -1
 
-    def surface(self, face, u, v):
+    def surface(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.SurfaceInteraction3f":
         """Mitsuba's surface interaction at points (u, v) of faces (UInt32, Float, Float [n])."""
         n = dr.width(face)
         prelim = dr.zeros(mi.PreliminaryIntersection3f, n)
@@ -79,28 +83,19 @@ class Faces:
 
     # ---- What messages call them ---------------------------------------------------------------
 
-    def refuse(self, bad, why):
+    def refuse(self, bad: ArrayLike, why: str) -> None:
         """Raise RadiosityError naming the shape of the first face in ``bad`` (bool [faces])."""
-        if bad.any():
+        if np.any(bad):
             raise RadiosityError(f"{self.name(self.shape[np.argmax(bad)])} {why}")
 
-    def name(self, shape):
+    def name(self, shape: int) -> str:
         """How messages call the shape of a number."""
-        return label(self.scene.shapes()[shape], shape)
+        return self.parts[shape].name
 
-    def names(self, which):
+    def names(self, which: np.ndarray) -> str:
         """The shapes of faces (a mask or numbers), three of them by name."""
         names = sorted({self.name(i) for i in np.unique(self.shape[which])})
         return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _tracing_scene(scene):
-    """The scene itself, or one in which every shape is a mesh."""
-    shapes = scene.shapes()
-    if all(isinstance(shape, mi.Mesh) for shape in shapes):
-        return scene
-    meshes = {f"shape_{i}": as_mesh(shape) for i, shape in enumerate(shapes)}
-    return mi.load_dict({"type": "scene"} | meshes, optimize=False)
 
 
 def _corners(scene):

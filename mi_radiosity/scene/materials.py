@@ -6,41 +6,59 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
-from ..core.points import triangle
+from ..core.points import Stream, kronecker, stream_seed, triangle
+from .faces import Faces
 from .lights import LIGHTS
-from .tessellate import can_mesh, label
+from .tessellate import UNMESHED, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
+WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
+SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
+AT_ONCE = 1 << 22  # samples in one launch
 
 
 class Materials:
-    """What the faces are made of: ``rho`` [2 sides, faces, 3], ``two_sided`` [faces], ``textured`` (is any of them?).
+    """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
+    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes].
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
 
-    def __init__(self, faces):
+    def __init__(self, faces: Faces) -> None:
         self._faces = faces
-        shapes = faces.scene.shapes()
+        shapes = faces.tracing.shapes()
         two_sided = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.BackSide) for s in shapes])
         self.two_sided = two_sided[faces.shape]
-        self.textured = any(is_textured(s.bsdf()) for s in shapes)
-        self.rho = self._mean(POINTS if self.textured else 1)
+        textured = np.array([is_textured(s.bsdf()) for s in shapes])
+        self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
+        self._traced_faces = owned(mi.UInt32, self.traced[faces.shape])
+        self.textured = bool((textured & ~self.traced).any())
+        self.rho = np.zeros((2, len(faces), 3))
+        plain = ~self.traced[faces.shape]
+        if plain.any():
+            self.rho[:, plain] = self._mean(np.flatnonzero(plain), POINTS if self.textured else 1)
+        self._find_albedos(textured)
         faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
-            (self.rho >= 1).any(axis=(0, 2)),
-            "has a reflectance of 1 or more, which conserves no energy: make it less than 1",
+            (self.rho > 1 + ROUNDING).any(axis=(0, 2)),
+            "has a reflectance of more than 1, which makes energy from nothing: make it less than 1",
         )
+        white = self.rho > WHITEST
+        if white.any():
+            where = faces.names(white.any(axis=(0, 2)))
+            faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
+            self.rho = np.minimum(self.rho, WHITEST)
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
-    def _mean(self, points):
-        """ρ averaged over points of every face [2 sides, faces, 3]."""
-        n = len(self._faces)
-        face, third, rho = dr.arange(mi.UInt32, n), mi.Float(1 / 3), np.zeros((2, n, 3))
+    def _mean(self, faces, points):
+        """ρ averaged over points of diffuse faces [2 sides, faces, 3]."""
+        n, third = len(faces), mi.Float(1 / 3)
+        face, rho = owned(mi.UInt32, faces), np.zeros((2, n, 3))
         for k in range(points):
             spread = triangle(*(mi.Float(x) for x in ((k + 0.5) / points, (k * 7 % points + 0.5) / points)))
             u, v = (x + dr.zeros(mi.Float, n) for x in ((third, third) if points == 1 else spread))
@@ -49,7 +67,46 @@ class Materials:
                 rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
         return rho
 
-    def reflectance_at(self, face, u, v, back):
+    def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do faces have lobes that are traced (Bool [n])?"""
+        if not self.traced.any():
+            return mi.Bool(False)
+        return dr.gather(mi.UInt32, self._traced_faces, face, active) != 0
+
+    def _find_albedos(self, textured):
+        """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""
+        shape = self._faces.shape
+        first = np.searchsorted(shape, np.arange(len(self.traced)))
+        solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
+        various = np.flatnonzero((self.traced & textured)[shape])
+        for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, FACE_SAMPLES, False)):
+            for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
+                albedo = self._albedo(part, samples) if len(part) else np.zeros((2, 0, 3))
+                for rho, side in zip(albedo, self.rho):
+                    if spread:
+                        for face, value in zip(part, rho):
+                            side[shape == shape[face]] = value
+                    else:
+                        side[part] = rho
+
+    def _albedo(self, faces, samples):
+        """E[w; diffuse] of BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+        each = opaque_index(samples)
+        k = dr.arange(mi.UInt32, len(faces) * samples)
+        face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
+        x, y, s, t = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO)))
+        a, b, c, _ = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO, 1)))
+        si, rho = self._faces.surface(face, *triangle(x, y)), []
+        wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
+        for side in (1, -1):
+            si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
+            sample, value = si.bsdf().sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
+            drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+            value = dr.select(drawn & dr.isfinite(value), value, 0)
+            rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
+        return np.array(rho)
+
+    def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
         si = self._faces.surface(face, u, v)
         si.wi = mi.Vector3f(0, 0, dr.select(back, -1.0, 1.0))
@@ -67,64 +124,61 @@ class Finding:
     why: str  # what is wrong and what to do
 
 
-def _nested(obj):
-    """The Mitsuba objects that ``obj`` is made of, itself excluded."""
-
-    class Collect(mi.TraversalCallback):
-        found = ()
-
-        def put(self, name, value, flags):
-            if hasattr(value, "class_name"):
-                self.found += (value,)
-
-    callback = Collect()
-    obj.traverse(callback)
-    return callback.found
-
-
-def _unsupported_bsdf(bsdf):
-    """Class name of the first part of ``bsdf`` that is not diffuse, or None."""
+def is_diffuse(bsdf: "mi.BSDF") -> bool:
+    """Is ``bsdf`` made of diffuse lobes that reflect, and of nothing else?"""
     kind = bsdf.class_name()
-    if kind in DIFFUSE:
-        return None
-    if kind not in NESTING:
-        return kind
-    parts = (part for part in _nested(bsdf) if isinstance(part, mi.BSDF))
-    return next((bad for part in parts if (bad := _unsupported_bsdf(part))), None)
+    if kind in NESTING:
+        return all(is_diffuse(part) for part in children(bsdf) if isinstance(part, mi.BSDF))
+    return kind in DIFFUSE
 
 
-def is_textured(bsdf) -> bool:
+def is_textured(bsdf: "mi.BSDF") -> bool:
     """Does the reflectance of ``bsdf`` vary over a surface?"""
     return any(
-        is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in _nested(bsdf)
+        is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in children(bsdf)
     )
 
 
-def _inspect_shape(shape, name):
-    if not can_mesh(shape):
-        yield Finding(name, "only meshes and disks are modelled: export it as a mesh")
+def _inspect_shape(shape):
+    """What is wrong with a shape."""
+    if shape.class_name() == "Instance":
+        yield "its shape group is not found: give the group an id, in the scene itself, and refer to it"
+    elif shape.class_name() in UNMESHED:
+        yield f"{UNMESHED[shape.class_name()]} are not modelled: export it as a mesh"
+    else:
+        yield "shapes of this kind are not modelled: export it as a mesh"
+
+
+def _inspect_part(part):
+    shape = part.shape
+    if not part.can_mesh:
+        yield from _inspect_shape(shape)
         return
     if shape.interior_medium() is not None or shape.exterior_medium() is not None:
-        yield Finding(name, "participating media are not modelled: remove the medium")
-    if bad := _unsupported_bsdf(shape.bsdf()):
-        yield Finding(name, f"its BSDF {bad} is not diffuse: use 'diffuse', 'twosided' or a 'blendbsdf' of those")
-    if shape.is_emitter() and mi.has_flag(shape.emitter().flags(), mi.EmitterFlags.SpatiallyVarying):
-        yield Finding(name, "its radiance is textured: use a constant radiance")
+        yield "participating media are not modelled: remove the medium"
+    if shape.is_emitter() and shape.emitter().get_medium() is not None:
+        yield "its emitter is in a medium, and those are not modelled: remove the medium"
 
 
-def inspect(scene) -> list[Finding]:
+def _inspect_emitter(emitter):
+    if emitter.class_name() not in LIGHTS:
+        yield f"emitters of this kind are not modelled: use one of {', '.join(LIGHTS)}"
+    elif refusal := LIGHTS.find(emitter.class_name()).refusal(emitter):
+        yield refusal
+
+
+def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
-    for index, shape in enumerate(scene.shapes()):
-        findings += _inspect_shape(shape, f"{label(shape, index)} ({shape.class_name()})")
+    for part in parts(scene):
+        findings += [Finding(f"{part.name} ({part.shape.class_name()})", why) for why in _inspect_part(part)]
     for index, emitter in enumerate(scene.emitters()):
-        if emitter.class_name() not in LIGHTS:
-            what = f"emitter '{emitter.id() or index}' ({emitter.class_name()})"
-            findings.append(Finding(what, "only constant area emitters are modelled: use an 'area' emitter"))
+        what = f"emitter '{emitter.id() or index}' ({emitter.class_name()})"
+        findings += [Finding(what, why) for why in _inspect_emitter(emitter)]
     return findings
 
 
-def require_supported(scene) -> None:
+def require_supported(scene: "mi.Scene") -> None:
     """Raise RadiosityError, naming the first part of ``scene`` that is not modelled."""
     findings = inspect(scene)
     if findings:

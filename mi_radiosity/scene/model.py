@@ -2,6 +2,7 @@
 
 import hashlib
 
+import mitsuba as mi
 import numpy as np
 
 from ..core.llvm import require_variant
@@ -20,13 +21,13 @@ class Model:
 
     sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
     not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many
-    sides no light reaches. ``fingerprint``: SHA-256 of geometry,
-    orientation, reflectance and emission. ``state``: what the scene was like when it was read.
+    sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance, emission and lamps.
+    ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
 
-    def __init__(self, scene, sides: np.ndarray | None = None, lit: bool = True):
+    def __init__(self, scene: "mi.Scene", sides: np.ndarray | None = None, lit: bool = True) -> None:
         require_variant()
         require_supported(scene)
         self.scene, self.state = scene, State(scene)
@@ -46,14 +47,18 @@ class Model:
         self.patches = self.rays.patches
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
-    def with_sides(self, sides) -> "Model":
+    def with_sides(self, sides: np.ndarray) -> "Model":
         """The same scene with other patches."""
         return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides, self.lights.required)
 
     def _find_overlaps(self):
         """Faces in one another: one of them is lit and shown wherever several are."""
         f, sound = self.faces, ~self.faces.degenerate
-        self._candidate = np.column_stack([sound, sound & self.materials.two_sided])  # [faces, front and back]
+        there = np.column_stack([sound, sound & self.materials.two_sided])  # [faces, front and back]
+        emits = self.lights.exitance.any(axis=1)[:, None] & [True, False]
+        # A side without a diffuse lobe receives nothing: what meets it goes on.
+        lobe = ~self.materials.traced[f.shape][:, None] | self.materials.rho.any(axis=2).T | emits
+        self._candidate = there & lobe if self.lights.required else there
         exitance = self.lights.exitance.sum(axis=1)
         return find_overlaps(
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, lift_of(f)
@@ -61,7 +66,7 @@ class Model:
 
     def _rays(self, sides, overlaps):
         patches = make_patches(self.faces, self.materials, self.lights, sides)
-        return Rays(self.faces, patches, overlaps.lookup(self.faces.centre))
+        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
 
     def _sides(self, which):
         """Sides chosen by a mask [faces, 2], in the order of the faces' ranks."""
@@ -85,4 +90,6 @@ class Model:
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
+        for light in self.lights.free:
+            digest.update(light.fingerprint())
         return digest.hexdigest()

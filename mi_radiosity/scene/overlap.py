@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import components, owned, owned_vectors
+from .faces import Faces
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
@@ -32,7 +33,7 @@ class Overlaps:
     over: np.ndarray
     covered: np.ndarray
 
-    def among(self, sides):
+    def among(self, sides: np.ndarray) -> "tuple[Overlaps, np.ndarray]":
         """These overlaps without what hides behind sides other than ``sides`` (int), and the faces that really lie in
         one another (int)."""
         there = np.zeros(self.covered.size, dtype=bool)
@@ -43,23 +44,26 @@ class Overlaps:
         faces = np.unique(np.concatenate([under[doubled], over[doubled]]) // 2)
         return Overlaps(self.corners, self.present, under, over, self.covered), faces
 
-    def lookup(self, centre) -> "Lookup | None":
+    def lookup(self, centre: np.ndarray) -> "Lookup | None":
         """The same on the device, for points relative to ``centre``; None if nothing overlaps."""
         return Lookup(self, centre) if len(self.under) else None
 
 
 class Lookup:
-    """Overlaps as tables on the device."""
+    """Overlaps as tables on the device; ``under`` and ``over`` as there."""
 
-    def __init__(self, overlaps, centre):
+    def __init__(self, overlaps: Overlaps, centre: np.ndarray) -> None:
         corner = overlaps.corners - centre
         edges = [corner[:, k] - corner[:, 0] for k in (1, 2)]
         self._triangles = [owned_vectors(mi.Point3f, corner[:, 0]), *(owned_vectors(mi.Vector3f, e) for e in edges)]
         self._starts = owned(mi.UInt32, np.searchsorted(overlaps.under, np.arange(overlaps.covered.size + 1)))
+        self.under, self.over = overlaps.under, overlaps.over
         self._over = owned(mi.UInt32, overlaps.over)
 
     @dr.syntax
-    def owner(self, face, back, u, v, active):
+    def owner(
+        self, face: "mi.UInt32", back: "mi.Bool", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool"
+    ) -> "tuple[mi.UInt32, mi.Bool, mi.Float, mi.Float]":
         """The face, side and coordinates that points (u, v) of sides belong to (UInt32, Bool, Float, Float)."""
         side = 2 * face + dr.select(back, mi.UInt32(1), mi.UInt32(0))
         p0, e1, e2 = (dr.gather(type(t), t, face, active) for t in self._triangles)
@@ -81,7 +85,9 @@ class Lookup:
         return side >> 1, (side & 1) == 1, u, v
 
 
-def find_overlaps(faces, present, exitance, reflectance, tolerance) -> Overlaps:
+def find_overlaps(
+    faces: Faces, present: np.ndarray, exitance: np.ndarray, reflectance: np.ndarray, tolerance: float
+) -> Overlaps:
     """Look for coplanar faces that share area.
 
     Per side, front and back: ``present`` (bool [faces, 2]), ``exitance``, ``reflectance`` [faces, 2];
@@ -101,7 +107,7 @@ def find_overlaps(faces, present, exitance, reflectance, tolerance) -> Overlaps:
 
 def _precedence(faces, present, exitance, reflectance):
     """Place of every side in the order in which points belong to sides (int [2 · faces])."""
-    surface = _surfaces(faces.corners, faces.normal)
+    surface = surfaces(faces.corners, faces.normal)
     size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
     first = np.full(surface.max() + 1, len(faces))
     np.minimum.at(first, surface, faces.rank)
@@ -112,10 +118,11 @@ def _precedence(faces, present, exitance, reflectance):
     return order
 
 
-def coplanar_pairs(corners, normal, area, sound, tolerance):
+def coplanar_pairs(
+    corners: np.ndarray, normal: np.ndarray, area: np.ndarray, sound: np.ndarray, tolerance: float
+) -> np.ndarray:
     """Ordered pairs (f, g) of ``sound`` faces in one plane whose interiors meet (two int [pairs])."""
     low, high = corners.min(axis=1), corners.max(axis=1)
-    offset = (corners[:, 0] * normal).sum(axis=1)
     found = [np.zeros((0, 2), dtype=np.int64)]
 
     def larger_first(f, g):
@@ -123,9 +130,18 @@ def coplanar_pairs(corners, normal, area, sound, tolerance):
         larger = area[f] >= area[g]
         return np.where(larger, f, g), np.where(larger, g, f)
 
+    centre = (low.min(axis=0) + high.max(axis=0)) / 2
+    first, normals = owned_vectors(mi.Point3f, corners[:, 0] - centre), owned_vectors(mi.Vector3f, normal)
+    areas = owned(mi.Float, area)
+
     def near_plane(f, g):
-        f, g = larger_first(f, g)
-        return np.abs(np.einsum("ij,ij->i", corners[g, 0], normal[f]) - offset[f]) <= 2 * tolerance
+        """Is a corner of the smaller face near the plane of the larger one? Most pairs end here, so on the device."""
+        f, g = mi.UInt32(f.astype(np.uint32)), mi.UInt32(g.astype(np.uint32))
+        larger = dr.gather(mi.Float, areas, f) >= dr.gather(mi.Float, areas, g)
+        f, g = dr.select(larger, f, g), dr.select(larger, g, f)
+        d = dr.gather(mi.Point3f, first, g) - dr.gather(mi.Point3f, first, f)
+        near = dr.abs(dr.dot(d, dr.gather(mi.Vector3f, normals, f))) <= dr.opaque(mi.Float, 4 * tolerance)
+        return np.array(near).astype(bool)
 
     for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, near_plane):
         f, g = larger_first(f, g)
@@ -134,8 +150,8 @@ def coplanar_pairs(corners, normal, area, sound, tolerance):
         f, g = f[near], g[near]
         axis = np.abs(normal[f]).argmax(axis=1)
         kept = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
-        flat = [np.take_along_axis(corners[k], np.broadcast_to(kept, (len(k), 3, 2)), axis=2) for k in (f, g)]
-        meet = _triangles_meet(*flat, tolerance)
+        p, q = (np.take_along_axis(corners[k], np.broadcast_to(kept, (len(k), 3, 2)), axis=2) for k in (f, g))
+        meet = _triangles_meet(p, q, tolerance)
         found.append(np.column_stack([f[meet], g[meet]]))
     pairs = np.concatenate(found)
     return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
@@ -159,7 +175,10 @@ def _covered(corners, under, over, shape):
 
 
 def _boxes_that_meet(low, high, faces, tolerance, likely):
-    """Yield ``likely`` pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge; the first is of the size of the second at least."""
+    """Yield ``likely`` pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge.
+
+    The first is of the size of the second at least.
+    """
     low, high = low - low.min(axis=0) - tolerance, high - low.min(axis=0) + tolerance
     level = np.frexp((high - low).max(axis=1))[1]
     for size in np.unique(level[faces]):
@@ -193,8 +212,9 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
             yield f[near], g[near]
 
 
-def _surfaces(corners, normal):
-    """A number per face, the same for faces joined by edges, within one plane, that they run along in opposite directions (int [faces])."""
+def surfaces(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions
+    (int [faces])."""
     n = len(corners)
     _, vertex = np.unique(np.round(corners.reshape(-1, 3), 12), axis=0, return_inverse=True)
     vertex = vertex.reshape(n, 3).astype(np.int64)

@@ -7,6 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NONE, owned, owned_vectors
+from .faces import Faces
+from .lights import Lights
+from .materials import Materials
 
 RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
@@ -37,17 +40,17 @@ class Patches:
     lift: "mi.Float"  # by which rays start off a surface, m
     corners: list  # three Point3f where the file has them, to the bit
 
-    def point(self, patch, u, v):
+    def point(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Point3f":
         """Points of patches, relative to the origin (Point3f [n])."""
         along, across = dr.gather(mi.Vector3f, self.e1, patch), dr.gather(mi.Vector3f, self.e2, patch)
         return dr.gather(mi.Point3f, self.p0, patch) + along * u + across * v
 
-    def above(self, patch, u, v):
+    def above(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Point3f":
         """Points of patches, lifted off them by the rounding of rays (Point3f [n])."""
         return mi.Point3f(self.point(patch, u, v) + dr.gather(mi.Vector3f, self.normal, patch) * self.lift)
 
 
-def make_patches(faces, materials, lights, sides) -> Patches:
+def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.ndarray) -> Patches:
     """Patches of the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
     face, back = np.argsort(faces.rank)[sides // 2], sides % 2
     sign, emits = np.where(back == 1, -1.0, 1.0)[:, None], (back == 0)[:, None]
@@ -71,12 +74,12 @@ def make_patches(faces, materials, lights, sides) -> Patches:
     )
 
 
-def lift_of(faces) -> float:
+def lift_of(faces: Faces) -> float:
     """By how much rays must start off a surface, and what lies in one plane, m."""
     return RAY_OFFSET * max(np.abs(faces.corners).max(), np.finfo(np.float32).tiny)
 
 
-def patch_table(faces, patches):
+def patch_table(faces: Faces, patches: Patches) -> "mi.UInt32":
     """The patch of every side 2 · face + (1 for the back), NONE where there is none (UInt32 [2 · faces])."""
     face, back = np.argsort(faces.rank)[patches.sides // 2], patches.sides % 2
     table = np.full(2 * len(faces), NONE, dtype=np.uint32)

@@ -7,7 +7,11 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, owned_vectors
 from ..core.points import cosine_direction
-from .patches import patch_table
+from .faces import Faces
+from .lobes import Lobes, Trail
+from .materials import Materials
+from .overlap import Lookup
+from .patches import Patches, patch_table
 
 
 @dataclass
@@ -18,40 +22,70 @@ class Hit:
     patch: "mi.UInt32"  # [rays]
     u: "mi.Float"  # [rays] barycentric coordinates on the face
     v: "mi.Float"
+    back: "mi.Bool"  # [rays] the side they meet is the back of its face
+    traced: "mi.Bool"  # [rays] the surface has lobes that are not diffuse
 
 
 class Rays:
     """Visibility in a scene, in the words of its patches."""
 
-    def __init__(self, faces, patches, overlaps=None):
+    def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
         self.scene, self.patches = faces.tracing, patches
+        self._materials = materials
+        self.lobes = Lobes() if materials.traced.any() else None
         self._first_face = faces.first_face
-        self._front = owned_vectors(mi.Vector3f, faces.normal)
+        self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
 
-    def leave(self, patch, u, v, s, t):
+    def leave(
+        self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", s: "mi.Float", t: "mi.Float"
+    ) -> "tuple[mi.Point3f, mi.Vector3f]":
         """Origin and cosine-distributed direction of rays that leave patches at (u, v) (Point3f, Vector3f [n])."""
         p = self.patches
         return p.above(patch, u, v) + p.origin, cosine_direction(dr.gather(mi.Vector3f, p.normal, patch), s, t)
 
-    def trace(self, origin, direction, active=True) -> Hit:
+    def trace(self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Hit:
         """Nearest hits of rays (Point3f, Vector3f [rays])."""
         prelim = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
         return self.locate(prelim, direction)
 
-    def locate(self, prelim, direction) -> Hit:
+    def locate(self, prelim: "mi.PreliminaryIntersection3f", direction: "mi.Vector3f") -> Hit:
         """Name the patches that intersections lie on."""
         valid = prelim.is_valid()
         face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
-        back = dr.dot(dr.gather(mi.Vector3f, self._front, face, valid), direction) > 0
-        u, v = prelim.prim_uv.x, prelim.prim_uv.y
+        back = dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
+        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid)
+
+    def side(self, face: "mi.UInt32", back: "mi.Bool", u: "mi.Float", v: "mi.Float", valid: "mi.Bool") -> Hit:
+        """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
         patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        return Hit(valid, dr.select(valid, patch, NONE), u, v)
+        traced = valid & self._materials.is_traced(face, valid)
+        return Hit(valid, dr.select(valid, patch, NONE), u, v, back, traced)
 
-    def on_top(self, patch, u, v):
+    def follow(
+        self,
+        origin: "mi.Point3f",
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        power: bool = False,
+        camera: bool = False,
+        active: "mi.Bool | bool" = True,
+    ) -> Hit | Trail:
+        """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
+
+        number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
+        camera: they look for light, and the first surface's own counts.
+        """
+        if self.lobes is None:
+            return self.trace(origin, direction, active)
+        mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
+        return self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, active)
+
+    def on_top(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Bool":
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""
         every = dr.full(mi.Bool, True, dr.width(u))
         if not self.overlaps:
@@ -60,13 +94,15 @@ class Rays:
         owner, of_back, _, _ = self.overlaps.owner(face, back, u, v, every)
         return (owner == face) & (of_back == back)
 
-    def blocked(self, a, b, active=True):
+    def blocked(self, a: "mi.Point3f", b: "mi.Point3f", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Does anything lie between points a and b, relative to the origin of the patches (Bool [n])?"""
         ray = mi.Ray3f(a + self.patches.origin, b - a)
         ray.maxt = 1 - 1e-5
         return self.scene.ray_test(ray, active=active)
 
-    def kernel(self, i, ui, vi, j, uj, vj):
+    def kernel(
+        self, i: "mi.UInt32", ui: "mi.Float", vi: "mi.Float", j: "mi.UInt32", uj: "mi.Float", vj: "mi.Float"
+    ) -> "mi.Float":
         """F(x, y) = V(x, y) cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n]).
 
         0 where the points see each other's back, or lie under another face.
@@ -74,7 +110,15 @@ class Rays:
         n_i = dr.gather(mi.Vector3f, self.patches.normal, i)
         return self.kernel_at(self.patches.point(i, ui, vi), n_i, j, uj, vj, self.on_top(i, ui, vi))
 
-    def kernel_at(self, x, normal, j, uj, vj, active=True):
+    def kernel_at(
+        self,
+        x: "mi.Point3f",
+        normal: "mi.Vector3f",
+        j: "mi.UInt32",
+        uj: "mi.Float",
+        vj: "mi.Float",
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Float":
         """F(x, y) between any points x, relative to the origin, with their normals, and points of patches (Float [n]).
 
         Evaluated as unnormalised cosines over r⁴.

@@ -12,11 +12,11 @@ class State:
     Keeps Dr.Jit's variables, so that a comparison costs no look at their contents unless they were replaced.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: "mi.Scene") -> None:
         self._shapes = [shape.ptr for shape in scene.shapes()]
         self._parameters = _parameters(scene)
 
-    def same_as(self, scene) -> bool:
+    def same_as(self, scene: "mi.Scene") -> bool:
         """Is ``scene`` as it was?"""
         if self._shapes != [shape.ptr for shape in scene.shapes()]:
             return False
@@ -26,20 +26,21 @@ class State:
         )
 
 
-def refuse_gradients(scene) -> None:
+def refuse_gradients(scene: "mi.Scene") -> None:
     """Raise RadiosityError if a parameter of the scene asks for gradients: a solution has none."""
-    for (_, name), value in _parameters(scene).items():
-        if dr.is_array_v(value) and dr.grad_enabled(value):
-            raise RadiosityError(
-                f"'{name}' asks for gradients, which a radiosity solution does not have yet: use 'prb'"
-            )
+    with dr.resume_grad():  # mi.render suspends them around an integrator
+        for (_, name), value in _parameters(scene).items():
+            if dr.is_array_v(value) and dr.grad_enabled(value):
+                raise RadiosityError(
+                    f"'{name}' asks for gradients, which a radiosity solution does not have yet: use 'prb'"
+                )
 
 
 def _parameters(scene):
     """{(number, name): value} of everything that decides what is solved."""
     things = [*scene.shapes(), *scene.emitters()]
     return {
-        (number, f"{thing.id() or number}.{name}"): value
+        (number, f"{thing.id() or number}.{name}"): type(value)(value)  # Mitsuba's own would change with the scene
         for number, thing in enumerate(things)
         for name, value in mi.traverse(thing)
     }

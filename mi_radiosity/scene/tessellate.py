@@ -1,6 +1,9 @@
 """Triangle meshes in the place of shapes that are not meshes: one mesher per class of Mitsuba's shapes."""
 
+import re
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -8,12 +11,24 @@ import numpy as np
 
 from ..core.plugins import Registry
 
-SEGMENTS = 32
+FEWEST, MOST = 12, 72  # segments around a shape
+OUTLINE = 1 / 2000  # of the size of the scene: by how much a silhouette may miss
 MESHERS = Registry("shape")
+UNMESHED = {  # classes of Mitsuba's shapes that there is no mesher for
+    "BSplineCurve": "curves",
+    "LinearCurve": "curves",
+    "SDFGrid": "signed distance fields",
+    "Ellipsoids": "ellipsoids",
+    "EllipsoidsMesh": "ellipsoids",
+}
 
 
 def mesher(shape_class: str) -> Callable:
-    """Decorator: the function makes an mi.Mesh of a shape whose ``class_name()`` this is."""
+    """Decorator: the function makes an mi.Mesh of a shape whose ``class_name()`` this is.
+
+    It is called with the shape and its share of the size of the scene (0 to 1), by which it may choose how fine the
+    mesh is.
+    """
 
     def register(function):
         MESHERS.add(shape_class, function)
@@ -22,47 +37,261 @@ def mesher(shape_class: str) -> Callable:
     return register
 
 
-def can_mesh(shape) -> bool:
-    return isinstance(shape, mi.Mesh) or shape.class_name() in MESHERS
+# ---- The shapes of a scene -------------------------------------------------------------------------
 
 
-def as_mesh(shape):
-    """``shape`` itself if it is a mesh, or the mesh its mesher makes."""
-    return shape if isinstance(shape, mi.Mesh) else MESHERS.find(shape.class_name())(shape)
+@dataclass(frozen=True)
+class Part:
+    """A shape that is traced: one of the scene's, or a member of the shape group that an instance places."""
+
+    shape: Any  # Mitsuba's
+    number: int  # in scene.shapes(), of the shape or of the instance
+    name: str  # for messages
+    to_world: np.ndarray | None = None  # [4, 4], of the instance
+
+    @property
+    def can_mesh(self) -> bool:
+        """Is it a mesh, or is there a mesher for it?"""
+        kind = self.shape.class_name()
+        return kind in MESHERS or (isinstance(self.shape, mi.Mesh) and kind not in UNMESHED)
 
 
-def label(shape, index) -> str:
+def label(shape: "mi.Shape", index: int) -> str:
     """How a shape is called in messages: its id, or its place in the scene."""
     return f"shape '{shape.id()}'" if shape.id() else f"shape {index}"
 
 
-@mesher("Disk")
-def disk_mesh(disk):
-    """A fan of triangles with exactly the area of ``disk``, so that a lamp keeps its power."""
-    angle = np.arange(SEGMENTS) / SEGMENTS
-    # Half-way out: Mitsuba finds these points by tracing, and rays at the very rim may miss.
-    ring = disk.eval_parameterization(mi.Point2f(0.5, mi.Float(angle.astype(np.float32))))
-    points = np.array(ring.p, dtype=np.float64).reshape(3, -1).T
-    centre = points.mean(axis=0)
-    radius = np.sqrt(2 * np.pi / SEGMENTS / np.sin(2 * np.pi / SEGMENTS))
-    outer = centre + 2 * radius * (points - centre)
-    first = np.arange(SEGMENTS) + 1
-    second = first % SEGMENTS + 1
-    normal = np.array(ring.sh_frame.n).reshape(3, -1)[:, 0]
-    if np.dot(np.cross(outer[0] - centre, outer[1] - centre), normal) < 0:
-        first, second = second, first
-    faces = np.column_stack([np.zeros(SEGMENTS, int), first, second])
-    return build_mesh(disk, np.vstack([centre, outer]), faces)
+def parts(scene: "mi.Scene") -> list[Part]:
+    """The shapes of a scene; instances come apart into the members of their group. Those whose group cannot be found
+    stay whole."""
+    groups, found = None, []
+    for number, shape in enumerate(scene.shapes()):
+        part = Part(shape, number, label(shape, number))
+        if shape.class_name() != "Instance":
+            found.append(part)
+            continue
+        if groups is None:
+            groups = {child.id(): child for child in children(scene) if child.class_name().startswith("ShapeGroup")}
+        # Mitsuba's Python side tells an instance's group only where it prints it.
+        name = re.search(r'name = "(.*)"', str(shape))
+        members = children(groups[name[1]]) if name and name[1] in groups else []
+        matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        for k, member in enumerate(m for m in members if isinstance(m, mi.Shape)):
+            found.append(
+                Part(member, number, f"{label(member, k)} of {part.name.replace('shape', 'instance')}", matrix)
+            )
+        if not members:
+            found.append(part)
+    return found
 
 
-def build_mesh(shape, vertices, faces):
-    """An ``mi.Mesh`` without vertex normals from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``."""
+def children(thing: "mi.Object") -> list:
+    """The Mitsuba objects that ``thing`` is made of."""
+
+    class Collect(mi.TraversalCallback):
+        found = ()
+
+        def put(self, name, value, *_):
+            if hasattr(value, "class_name"):
+                self.found += (value,)
+
+    callback = Collect()
+    thing.traverse(callback)
+    return list(callback.found)
+
+
+def tracing_scene(scene: "mi.Scene") -> "tuple[mi.Scene, list[Part]]":
+    """The scene itself, or one in which every shape is a mesh, and its parts in Mitsuba's order."""
+    found = parts(scene)
+    if all(part.to_world is None and isinstance(part.shape, mi.Mesh) for part in found):
+        return scene, found
+    box = scene.bbox()
+    size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+    meshes, names = [as_mesh(part, size) for part in found], [part.shape.id() for part in found]
+    tracing = mi.load_dict({"type": "scene"} | {f"shape_{i}": mesh for i, mesh in enumerate(meshes)}, optimize=False)
+    for part, name in zip(found, names):
+        part.shape.set_id(name)  # load_dict has given those that are in both scenes another
+    by_pointer = {mesh.ptr: part for mesh, part in zip(meshes, found)}
+    return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()]
+
+
+def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":
+    """The mesh of a part where it stands: its shape, if that is one."""
+    shape = part.shape
+    if not isinstance(shape, mi.Mesh):
+        box = shape.bbox()
+        extent = np.linalg.norm(np.array(box.max) - np.array(box.min))
+        if part.to_world is not None:
+            extent *= np.cbrt(abs(np.linalg.det(part.to_world[:3, :3])))
+        shape = MESHERS.find(shape.class_name())(shape, min(float(extent) / max(scene_size, 1e-30), 1.0))
+    return shape if part.to_world is None else placed(shape, part.to_world)
+
+
+# ---- Making meshes ---------------------------------------------------------------------------------
+
+
+def build_mesh(
+    shape: "mi.Shape",
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    normals: np.ndarray | None = None,
+    uv: np.ndarray | None = None,
+    flipped: bool = False,
+) -> "mi.Mesh":
+    """An ``mi.Mesh`` from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``; with normals [n, 3] and texture
+    coordinates [n, 2] of the vertices, where they are given. ``flipped``: its front is where the normals point away."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = shape.bsdf()
-    mesh = mi.Mesh(shape.id(), len(vertices), len(faces), props=properties)
+    properties["flip_normals"] = flipped
+    given = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uv is not None}
+    mesh = mi.Mesh(shape.id(), len(vertices), len(faces), props=properties, **given)
     params = mi.traverse(mesh)
-    params["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).ravel())
-    params["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).ravel())
+    params["vertex_positions"] = _flat(mi.Float, vertices)
+    params["faces"] = _flat(mi.UInt32, faces)
+    if uv is not None:
+        params["vertex_texcoords"] = _flat(mi.Float, uv)
     params.update()
+    if normals is not None:  # new positions make Mitsuba find normals of its own
+        params["vertex_normals"] = _flat(mi.Float, normals)
+        params.update()
     dr.eval(params["vertex_positions"])
     return mesh
+
+
+def _flat(kind, array):
+    return kind(np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32).ravel())
+
+
+def placed(mesh: "mi.Mesh", to_world: np.ndarray) -> "mi.Mesh":
+    """A copy of a mesh under a transform [4, 4]."""
+
+    def rows(array, width):
+        return np.array(array, dtype=np.float64).reshape(-1, width)
+
+    linear, faces = to_world[:3, :3], rows(mesh.faces_buffer(), 3)
+    vertices = rows(mesh.vertex_positions_buffer(), 3) @ linear.T + to_world[:3, 3]
+    normals = uv = None
+    if mesh.has_vertex_normals() and not mesh.has_face_normals():
+        normals = _unit(rows(mesh.vertex_normals_buffer(), 3) @ np.linalg.inv(linear))
+    if mesh.has_vertex_texcoords():
+        uv = rows(mesh.vertex_texcoords_buffer(), 2)
+    if np.linalg.det(linear) < 0:
+        faces = faces[:, ::-1]  # normals do not turn round in a mirror
+    copy = build_mesh(mesh, vertices, faces, normals, uv, mesh.has_flipped_normals())
+    for name in _attributes(mesh):
+        values = np.array(mesh.attribute_buffer(name))
+        rows_of = len(faces) if name.startswith("face_") else len(vertices)
+        copy.add_attribute(name, len(values) // rows_of, values)
+    return copy
+
+
+def _attributes(mesh):
+    """Names of a mesh's own attributes, such as colours of its vertices."""
+    known = {"vertex_positions", "vertex_normals", "vertex_texcoords", "faces"}
+    return [name for name in mi.traverse(mesh).keys() - known if name.startswith(("vertex_", "face_"))]
+
+
+def _unit(vectors):
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-30)[:, None]
+
+
+# ---- Meshers ---------------------------------------------------------------------------------------
+
+
+def segments(share: float) -> int:
+    """Segments around a round shape, a multiple of 4: few, yet a silhouette misses by no more than OUTLINE of the size
+    of the scene, half a pixel where a picture of all of it has 1000."""
+    wanted = np.pi * np.sqrt(share / (4 * OUTLINE) / 2)  # r (1 − cos(π/n)), half of it inwards and half outwards
+    return 4 * int(np.ceil(np.clip(wanted, FEWEST, MOST) / 4))
+
+
+def _standing(shape, vertices, faces, uv, normals=None):
+    """A mesh of a shape whose vertices [n, 3] and normals are given before ``to_world``; faces are turned so that they
+    look where the normals do, for flat shapes along z."""
+    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    up = normals if normals is not None else np.array([[0.0, 0.0, 1.0]])
+    up = _unit(up @ np.linalg.inv(matrix[:3, :3]))
+    vertices, flipped = vertices @ matrix[:3, :3].T + matrix[:3, 3], shape.has_flipped_normals()
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if (cross * up[faces[:, 0] if normals is not None else [0]]).sum() < 0:
+        faces = faces[:, ::-1]
+    return build_mesh(shape, vertices, faces, None if normals is None else up, uv, flipped)
+
+
+@mesher("Disk")
+def disk_mesh(disk: "mi.Shape", share: float) -> "mi.Mesh":
+    """Rings of triangles with exactly the area of ``disk``; every ring has twice the segments of the one inside it."""
+    n, radius = segments(share), 1.0
+    stretch = np.sqrt(np.pi / (n / 2 * np.sin(2 * np.pi / n)))
+    rings, wedges, first = [], [], 0
+    while True:
+        k = np.arange(n + 1)
+        rings.append(np.column_stack([np.full(n + 1, radius), k / n]))
+        k, inner = k[:-1], first + n + 1
+        if n % 2 or n <= 8:
+            rings.append(np.column_stack([np.zeros(n), (k + 0.5) / n]))  # the centre, once per segment for the textures
+            wedges.append(np.column_stack([inner + k, first + k, first + k + 1]))
+            break
+        n, radius = n // 2, radius / 2
+        k = np.arange(n)
+        outer = first + 2 * k
+        for triangle in (
+            (inner + k, outer, outer + 1),
+            (inner + k, outer + 1, inner + k + 1),
+            (inner + k + 1, outer + 1, outer + 2),
+        ):
+            wedges.append(np.column_stack(triangle))
+        first = inner
+    uv, faces = np.vstack(rings), np.vstack(wedges)
+    vertices = stretch * uv[:, :1] * _circle(uv[:, 1])
+    return _standing(disk, np.column_stack([vertices, np.zeros(len(uv))]), faces, uv)
+
+
+@mesher("Cylinder")
+def cylinder_mesh(cylinder: "mi.Shape", share: float) -> "mi.Mesh":
+    """A prism with exactly the area of ``cylinder`` (if it is round), and the cylinder's normals."""
+    matrix = np.array(mi.traverse(cylinder)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    n, (radius, _, length) = segments(share), np.linalg.norm(matrix[:3, :3], axis=0)
+    rows = int(np.clip(np.ceil(length * n / (2 * np.pi * radius) / 4), 1, 16))  # triangles at most four times as long
+    i, j = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(rows)))
+    low, high = j * (n + 1) + i, (j + 1) * (n + 1) + i
+    faces = np.vstack([np.column_stack([low, low + 1, high + 1]), np.column_stack([low, high + 1, high])])
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(n + 1) / n, np.arange(rows + 1) / rows))
+    around = _circle(u)
+    stretch = np.pi / (n * np.sin(np.pi / n))
+    normals = np.column_stack([around, np.zeros(len(u))])
+    return _standing(cylinder, np.column_stack([stretch * around, v]), faces, np.column_stack([u, v]), normals)
+
+
+@mesher("Sphere")
+def sphere_mesh(sphere: "mi.Shape", share: float) -> "mi.Mesh":
+    """Eight octants of equal triangles with exactly the area of ``sphere``, and its normals."""
+    n = segments(share) // 4
+    j, i = (x[np.tril_indices(n + 1)] for x in np.indices((n + 1, n + 1)))  # from the pole down, and around
+    at = lambda j, i: j * (j + 1) // 2 + i
+    rows, k = j[j < n], i[j < n]
+    up = np.column_stack([at(rows, k), at(rows + 1, k), at(rows + 1, k + 1)])
+    below = k < rows
+    down = np.column_stack([at(rows, k), at(rows + 1, k + 1), at(rows, k + 1)])[below]
+    octant, count = np.vstack([up, down]), len(j)
+    grids: list[np.ndarray] = []
+    octants: list[np.ndarray] = []
+    for quarter in range(4):
+        around = np.where(j > 0, (quarter + i / np.maximum(j, 1)) / 4, (quarter + 0.5) / 4)
+        for south in (False, True):
+            octants.append((octant[:, ::-1] if south else octant) + len(grids) * count)
+            grids.append(np.column_stack([around, (1 - j / (2 * n)) if south else j / (2 * n)]))
+    uv, faces = np.vstack(grids), np.vstack(octants)
+    height = np.where(uv[:, 1] == 0.5, 0, np.cos(np.pi * uv[:, 1]))
+    across = np.where(np.isin(uv[:, 1], (0, 1)), 0, np.sin(np.pi * np.minimum(uv[:, 1], 1 - uv[:, 1])))
+    normals = np.column_stack([across[:, None] * _circle(uv[:, 0]), height])
+    corners = normals[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    return _standing(sphere, np.sqrt(4 * np.pi / area) * normals, faces, uv, normals)
+
+
+def _circle(turn):
+    """Points of the unit circle (NumPy [n, 2]), where it closes the same to the bit."""
+    angle = 2 * np.pi * np.where(turn == 1, 0, turn)
+    return np.column_stack([np.cos(angle), np.sin(angle)])

@@ -1,6 +1,6 @@
 """One layer of light per lamp: sums of them, scaled, are the light of lamps dimmed and recoloured."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
@@ -65,7 +65,7 @@ class Layers:
         )
         return {
             "model": model,
-            "elements": self.elements.with_patches(model.patches),
+            "elements": _lit(self.elements, self.lamps, model, scales),
             "direct": direct,
             "indirect": indirect,
             "landings": self._landings(scales),
@@ -112,7 +112,7 @@ def solve_layers(
     flows, powers, done = [], [], 0
     for number, (share, only) in enumerate(zip(_shares(lamps, rays), _one_by_one(len(lamps)))):
         model = lamps.dimmed(only)
-        one = replace(problem, model=model, elements=problem.elements.with_patches(model.patches))
+        one = replace(problem, model=model, elements=_lit(problem.elements, lamps, model, only))
         flow, power = carry(one, share, number, done)
         flows.append(flow)
         powers.append(power)
@@ -126,7 +126,12 @@ def solve_layers(
     return Layers(lamps, problem.elements, stack("direct"), stack("indirect"), u, v, power, ones), flows
 
 
-def _one_by_one(count) -> Iterator[np.ndarray]:
+def _lit(elements, lamps, model, scales):
+    """Elements with the emission of a dimmed model."""
+    return elements.with_light(model.patches, lamps.exitance(elements.exitance, elements.patch, scales))
+
+
+def _one_by_one(count):
     for k in range(count):
         yield np.repeat(np.eye(count)[k][:, None], 3, axis=1)
 

@@ -1,6 +1,7 @@
 """Refinement: from patches to a mesh, worst pairs first."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
@@ -9,8 +10,9 @@ import mitsuba as mi
 from ..core.arrays import NONE, concat
 from ..core.errors import RadiosityError
 from ..core.points import Stream, stream_seed
-from ..mesh import Exposure
-from ..transport import Problem
+from ..mesh import Exposure, Pairs, Tree
+from ..scene import Model
+from ..transport import Problem, Transport
 from ..transport.problem import Record
 
 GROWTH = 0.1  # of the leaves may split in one wave,
@@ -34,7 +36,18 @@ class Refinement:
     Afterwards ``epsilon`` is the ε reached, ``rays`` the pilot rays cast, ``first_share`` the lamps' part of the power.
     """
 
-    def __init__(self, model, tree, pairs, pilot, elements, epsilon, seed, progress=lambda done: None, exact=True):
+    def __init__(
+        self,
+        model: Model,
+        tree: Tree,
+        pairs: Pairs,
+        pilot: Transport,
+        elements: int | None,
+        epsilon: float | None,
+        seed: int,
+        progress: Callable[[int], None] = lambda done: None,
+        exact: bool = True,
+    ) -> None:
         self._model, self._tree, self._pairs, self._pilot = model, tree, pairs, pilot
         self._wanted, self._least, self._exact = elements, epsilon or 0.0, exact
         self._seed, self._progress = seed, progress

@@ -1,24 +1,32 @@
 """What a solve leaves behind."""
 
 import json
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..core.arrays import NONE, opaque_index, owned, owned_vectors
+from ..core.arrays import NONE, owned, owned_vectors
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
-from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed, uniform
 from ..mesh import Elements, Exposure
+from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
 from ..scene import Model
 from ..scene.lamps import Lamps
+from ..scene.nearest import nearest_face
+from ..scene.patches import lift_of
 from ..transport import Gatherer, ViewFactors, view_factors
 from ..transport.landings import Landings
+from ..transport.probe import probe
+from .field import Field
 from .layers import Layers, Scales
 
 FORMAT = 3
@@ -35,7 +43,7 @@ class Leaves:
 
     vertices: np.ndarray  # [leaves, 3, 3] m, in the coordinates of the scene
     shape: np.ndarray  # [leaves] number of the shape in scene.shapes()
-    face: np.ndarray  # [leaves] number of the face within its shape
+    face: np.ndarray  # [leaves] number of the face within its shape, or within the member of an instance
     back: np.ndarray  # [leaves] bool: the back of the face
     level: np.ndarray  # [leaves] how often its patch was split
     area: np.ndarray  # [leaves] m²
@@ -43,7 +51,7 @@ class Leaves:
     irradiance: np.ndarray  # [leaves, 3] W/m²
     radiosity: np.ndarray  # [leaves, 3] W/m²
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.area)
 
 
@@ -66,23 +74,80 @@ class Solution:
     stats: dict
     layers: Layers | None = None
 
-    def irradiance(self, points=None, normals=None, *, lux: bool = False, samples: int = 1024, seed: int = 0):
+    def irradiance(
+        self,
+        points: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
+        *,
+        lux: bool = False,
+        samples: int = 1024,
+        seed: int = 0,
+        return_error: bool = False,
+        progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    ) -> "np.ndarray | tuple[np.ndarray, np.ndarray] | mi.Color3f":
         """Irradiance H at any points of the scene, gathered there: W/m² per channel (NumPy [n, 3]), or with ``lux``
         illuminance, lx (NumPy [n]): 179 lm/W times the luminance of H by Rec. 709's weights.
 
-        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps, and
-        as many rays into the room, per point. Without points: H of all elements (Color3f [elements]).
+        points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps,
+        and as many rays into the room, per point, rounded up to a multiple of 16. With ``return_error`` the result is
+        a pair: the values and their standard errors, which are rather too large than too small, and do not know of
+        the errors of the solution. Without points: H of all elements (Color3f [elements]).
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
             return self.direct + self.indirect
-        points, normals = _checked_points(points, normals)
-        gathered = self._gather(points, normals, samples, seed) if len(points) else np.zeros((0, 3))
-        return LUMENS_PER_WATT * gathered @ LUMINANCE if lux else gathered
+        where, towards = _checked_points(points, normals)
+        if samples < 1:
+            raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+        gatherer = self.gatherer()
+        report = partial(progress, "gather")
+        found = probe(gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
+        if lux:
+            # The channels' errors go together, as their samples are the same.
+            found = (LUMENS_PER_WATT * found[0] @ LUMINANCE, LUMENS_PER_WATT * found[1] @ LUMINANCE)
+        return found if return_error else found[0]
 
-    def radiosity(self):
-        """B = E + ρ H, W/m² (Color3f [elements])."""
-        return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+    def radiosity(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> "np.ndarray | mi.Color3f":
+        """B = E + ρ H, W/m², of the continuous field on the surface nearest to each point (NumPy [n, 3]); NaN for
+        points farther from all than 1 % of the scene's diagonal.
+
+        points [n, 3] in m; normals [n, 3], of any length: which side of a surface is meant; by default the front, or
+        the back if light reaches only that. Without points: B of all elements (Color3f [elements]).
+        Raises RadiosityError for points or normals that are not finite, or do not fit together.
+        """
+        if points is None:
+            return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+        where, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
+        if len(where) == 0:
+            return np.zeros((0, 3))
+        model, rays = self.model, self.model.rays
+        given = 0 * given if normals is None else given
+        face, u, v, near = nearest_face(model.faces, where, given, lift_of(model.faces))
+        facing = dr.dot(owned_vectors(mi.Vector3f, given), dr.gather(mi.Vector3f, rays.front, face))
+        front, back = (rays.side(face, dr.full(mi.Bool, side, len(where)), u, v, near) for side in (False, True))
+        behind = facing < 0 if normals is not None else front.patch == NONE
+        hit = dr.select(behind, back, front)
+        return np.where(np.array(near)[:, None], np.array(self._shown_radiosity(hit)).T, np.nan)
+
+    def _shown_radiosity(self, hit):
+        """B where something meets patches, 0 where not (Color3f [n])."""
+        patches, lit = self.model.patches, hit.patch != NONE
+        patch = dr.select(lit, hit.patch, 0)
+        leaf = self.elements.leaf_at(patch, hit.u, hit.v, lit)
+        rho = dr.gather(mi.Color3f, patches.reflectance, patch)
+        if self.model.materials.textured:
+            rho = self.model.materials.reflectance_at(dr.gather(mi.UInt32, patches.face, patch), hit.u, hit.v, hit.back)
+        B = dr.gather(mi.Color3f, patches.emission, patch) + rho * self.field.at(leaf, hit.u, hit.v, lit)
+        return dr.select(lit, B, 0)
+
+    @cached_property
+    def field(self) -> Field:
+        """H as a continuous field over the surfaces."""
+        return Field(self)
+
+    def gatherer(self) -> Gatherer:
+        """What gathers irradiance at any places, by this solution's radiosity."""
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
 
     def _reflected(self):
         return self.elements.reflectance * self.irradiance()
@@ -99,7 +164,7 @@ class Solution:
 
         return Leaves(
             vertices=np.stack(corners, axis=1) + faces.centre,
-            shape=faces.shape[face],
+            shape=np.array([part.number for part in faces.parts])[faces.shape[face]],
             face=face - np.searchsorted(faces.shape, faces.shape[face]),
             back=np.array(dr.gather(mi.Bool, e.patches.back, patch)).astype(bool),
             level=np.array(e.level(leaf)),
@@ -109,7 +174,9 @@ class Solution:
             radiosity=of(mi.Color3f, self.radiosity()),
         )
 
-    def render(self, sensor=0, spp: int = 16, shading: str = "gouraud", seed: int = 0) -> "mi.TensorXf":
+    def render(
+        self, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+    ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         Raises RadiosityError if the scene has been edited since it was solved.
@@ -144,32 +211,15 @@ class Solution:
         if not self.model.state.same_as(self.model.scene):
             raise RadiosityError("the scene has been edited since it was solved: solve it again")
 
-    def _gather(self, points, normals, samples, seed):
-        patches = self.model.patches
-        gatherer = Gatherer(self.model, self.elements, self._reflected())
-        each, n = opaque_index(samples), len(points)
-        total, at_once = np.zeros((n, 3)), max(1, (1 << 22) // samples)
-        stream = opaque_index(stream_seed(seed, Stream.MEASURE))
-        for first in range(0, n, at_once):
-            part = slice(first, min(first + at_once, n))
-            k = dr.arange(mi.UInt32, (part.stop - first) * samples)
-            of, line = k // each, k % each
-            x = dr.gather(mi.Point3f, owned_vectors(mi.Point3f, points[part] - self.model.faces.centre), of)
-            normal = dr.gather(mi.Vector3f, owned_vectors(mi.Vector3f, normals[part]), of)
-            key = hash_pair(of + opaque_index(first), 0)
-            a, b, s, t = kronecker(line, key, stream)
-            lot = (mi.Float(line) + uniform(key ^ 0xA511E9B3, stream)) / mi.Float(each)
-            origin = x + patches.origin + normal * patches.lift
-            H = gatherer.direct(x, normal, lot, a, b) + gatherer.indirect(origin, cosine_direction(normal, s, t))
-            total[part] = np.array([dr.block_sum(c, samples) for c in H]).T / samples
-        return total
-
     # ---- Files ---------------------------------------------------------------------------------
 
-    def save(self, path) -> None:
-        """Write the solution as NumPy archive (.npz); no file is left half-written."""
+    def save(self, path: str | os.PathLike[str], source: dict | None = None) -> None:
+        """Write the solution as NumPy archive (.npz); no file is left half-written.
+
+        source: where the scene came from, for `source_of` to tell.
+        """
         e = self.elements
-        arrays = {name: np.array(getattr(e, name)) for name in TREE}
+        arrays: dict[str, Any] = {name: np.array(getattr(e, name)) for name in TREE}
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
@@ -182,11 +232,21 @@ class Solution:
                 fingerprint=self.model.fingerprint,
                 sides=self.model.patches.sides,
                 stats=json.dumps(self.stats),
+                source=json.dumps(source),
                 **arrays,
             )
 
     @staticmethod
-    def load(path, scene: "mi.Scene | Model") -> "Solution":
+    def source_of(path: str | os.PathLike[str]) -> dict | None:
+        """Where the scene of a kept solution came from, as `save` was told; None if it was not.
+
+        Raises RadiosityError if the file is no solution, or is damaged.
+        """
+        data, _ = _read(path)
+        return json.loads(str(data["source"])) if "source" in data else None
+
+    @staticmethod
+    def load(path: str | os.PathLike[str], scene: "mi.Scene | Model") -> "Solution":
         """Read a solution of ``scene``.
 
         Raises RadiosityError if the file is no solution, is damaged, or belongs to another scene.
@@ -202,7 +262,11 @@ class Solution:
         reflectance, direct, indirect = (owned_vectors(mi.Color3f, data[name].T) for name in COLORS)
         arrays = {name: owned(mi.Float if data[name].dtype.kind == "f" else mi.UInt32, data[name]) for name in TREE}
         area = dr.gather(mi.Float, model.patches.area, arrays["patch"]) * arrays["scale"] ** 2
-        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance})
+        exitance = None
+        if model.lights.textured:
+            frame = (arrays[name] for name in ("patch", "u0", "v0", "scale"))
+            exitance = mean_exitance(model.patches, model.lights, *frame)
+        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance}, exitance)
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)

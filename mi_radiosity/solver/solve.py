@@ -14,13 +14,13 @@ from ..mesh import Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
-from ..transport import PILOT, Problem, Shooting, Starved, Transport
+from ..transport import PILOT, Gathering, Problem, Shooting, Transport
 from .layers import POWERS, solve_layers
 from .refine import Refinement
 from .solution import Solution
 
-ELEMENTS = 19_000  # default mesh: so many leaves more than patches, or twice the patches
-RAYS_PER_ELEMENT = 300  # default ray budget
+ELEMENTS = 19_000  # default mesh: so many leaves more than patches
+RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 
 
 @interruptible()
@@ -42,8 +42,9 @@ def solve(
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more than the scene has patches, or twice the patches, unless the oracle finds less
-    to refine. rays: rays that carry the power, used exactly; 300 per element by default. lines: random
+    either, 19,000 more than the scene has patches, unless the oracle finds less
+    to refine. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
+    elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
     default. layers: keep the light of every lamp by itself, for `Solution.relight`; the rays are shared out by the
@@ -60,7 +61,7 @@ def solve(
     wanted = _wanted(model, elements, epsilon)
     clock.lap("scene")
 
-    tree = Tree(model.patches, model.materials)
+    tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
         model,
@@ -78,19 +79,21 @@ def solve(
     problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
     clock.lap("refine")
 
-    rays = int(rays or RAYS_PER_ELEMENT * tree.leaf_count)
+    rays = int(rays or RAYS_PER_ELEMENT * min(tree.leaf_count, ELEMENTS) + LEAST_RAYS * tree.leaf_count)
+    shot = 0
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays; returns a Flow and its power balance."""
-        starved = Starved(problem, rays_here, seed)
+        nonlocal shot
+        gathering = Gathering(problem, rays_here, seed)
+        count = rays_here - gathering.rays
+        shot += count
+        stream = stream_seed(seed, Stream.POWER, number)
         flow = transport(
-            problem,
-            rays_here - starved.rays,
-            stream_seed(seed, Stream.POWER, number),
-            refinement.first_share,
-            lambda done: report("distribute", before + done + starved.rays, rays),
+            problem, count, stream, refinement.first_share, lambda done: report("distribute", before + done, rays)
         )
-        return starved.feed(flow), _balance(problem, flow)
+        power = _balance(problem, flow)
+        return gathering.feed(flow, lambda done: report("distribute", before + count + done, rays)), power
 
     if layers:
         kept, flows = solve_layers(problem, rays, carry, Lamps(model))
@@ -107,6 +110,8 @@ def solve(
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
         "rays": sum(flow.rays for flow in flows),
+        "power_rays": shot,
+        "gather_rays": rays - shot,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0,
         "pilot_rays": refinement.rays,
         "iterations": max(flow.iterations for flow in flows),
@@ -142,10 +147,11 @@ def _wanted(model, elements, epsilon):
     if epsilon is not None:
         return None
     if elements is None:
-        return count + max(ELEMENTS, count)
+        return count + ELEMENTS
     if elements < count:
         raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: ask for at least {count} elements"
+            f"the scene has {count} patches, so {elements} elements cannot be reached: "
+            f"ask for at least {count} elements"
         )
     return elements
 
@@ -153,9 +159,9 @@ def _wanted(model, elements, epsilon):
 class _Clock:
     """Seconds by stage."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._start = self._last = time.perf_counter()
-        self._stages = {}
+        self._stages: dict[str, float] = {}
 
     def lap(self, stage):
         dr.sync_thread()
@@ -167,9 +173,9 @@ class _Clock:
 
 
 def _balance(problem, flow):
-    """Emitted, absorbed, escaped and unshot power, W [POWERS, 3].
+    """Emitted, absorbed, escaped and unshot power of a transport, W [POWERS, 3].
 
-    What is absorbed comes from the irradiance of the solution, not from counting rays.
+    What is absorbed comes from its irradiance, not from counting rays.
     """
     leaves, elements = problem.elements.leaves, problem.elements
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)

@@ -1,19 +1,20 @@
 """How power gets about: emitted, deposited, tallied, summed up; and gathered where it is asked for."""
 
 from .factors import Closure, ViewFactors, view_factors
-from .gather import Gatherer
+from .gather import Gatherer, Places
+from .gathering import Gathering
 from .problem import Flow, Problem
 from .series import PILOT, Shooting, Transport
-from .starved import Starved
 
 __all__ = [
     "PILOT",
     "Closure",
     "Flow",
     "Gatherer",
+    "Gathering",
+    "Places",
     "Problem",
     "Shooting",
-    "Starved",
     "Transport",
     "ViewFactors",
     "view_factors",

@@ -4,23 +4,37 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE
+from ..scene.lobes import Trail
+from ..scene.rays import Hit
+from .emit import Batch
+from .problem import Problem
 
 
-def pair_of(problem, batch, hit):
-    """The pair without children that each ray belongs to, NONE before its root exists (UInt32 [rays])."""
-    on_patch = (hit.patch != NONE) & (batch.patch != NONE)
+def pair_of(problem: Problem, batch: Batch, hit: Hit | Trail) -> "mi.UInt32":
+    """The pair without children that each ray belongs to (UInt32 [rays]).
+
+    NONE before its root exists, and for rays that belong to no pair: those of lamps that are no surface, and those
+    that went on through a lobe.
+    """
+    on_patch = straight(batch, hit)
     pair = problem.pairs.find_roots(hit.patch, batch.patch, on_patch)
     return problem.pairs.descend(pair, hit.u, hit.v, batch.u, batch.v, pair != NONE)
 
 
-def spread(problem, hit, pair):
-    """Over the receiver of the pair, or all of the patch, whatever stands between: smooth, for pilots (UInt32 [rays])."""
+def straight(batch: Batch, hit: Hit | Trail) -> "mi.Bool":
+    """Did rays go straight from a patch to a patch (Bool [rays])?"""
+    on_patch = (hit.patch != NONE) & (batch.patch != NONE)
+    return on_patch & ~hit.bounced if isinstance(hit, Trail) else on_patch
+
+
+def spread(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
+    """Over the receiver of the pair, or all of the patch: smooth, for pilots (UInt32 [rays])."""
     known = pair != NONE
     return dr.select(known, dr.gather(mi.UInt32, problem.pairs.receiver, pair, known), hit.patch)
 
 
-def trusted(problem, hit, pair):
-    """Over the receiver of a pair that the oracle has seen in full view, else to the leaf the ray meets (UInt32 [rays]).
+def trusted(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
+    """Over the receiver of a pair the oracle has seen in full view, else to the leaf the ray meets (UInt32 [rays]).
 
     Spreading it over a receiver that something hides a part of, or that a wall crosses, would let light through.
     """

@@ -1,5 +1,6 @@
 """Rays that carry power away: from leaves, and from lamps that are no surfaces."""
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -7,6 +8,9 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, Distribution, opaque_index
 from ..core.points import hash_pair, kronecker, triangle, uniform
+from ..scene import Light
+from .landings import Landings
+from .problem import Problem
 
 AT_ONCE = 1 << 23  # rays cast in one launch: bounds memory, and the time until an interrupt is heard
 
@@ -26,18 +30,18 @@ class Batch:
     starts: "mi.Bool"  # False for rays that start under another face
 
 
-def launches(count):
+def launches(count: int) -> "Iterator[mi.UInt32]":
     """Numbers of ``count`` rays, AT_ONCE at a time (UInt32 each)."""
     for first in range(0, count, AT_ONCE):
         yield opaque_index(first) + dr.arange(mi.UInt32, min(AT_ONCE, count - first))
 
 
-def numbered_through(ray, at, leaves):
+def numbered_through(ray: "mi.UInt32", at: "_At", leaves: "LeafEmitter") -> "tuple[mi.Float, ...]":
     """Points of rays numbered through: rays of neighbouring leaves are well spread among each other."""
     return kronecker(ray, at.iteration, at.seed)
 
 
-def numbered_by_leaf(ray, at, leaves):
+def numbered_by_leaf(ray: "mi.UInt32", at: "_At", leaves: "LeafEmitter") -> "tuple[mi.Float, ...]":
     """Points of rays numbered within their leaf, so that what happens elsewhere leaves the rays here alone."""
     start = at.distribution.start(at.row) / at.spacing - at.jitter
     number = ray - mi.UInt32(dr.maximum(dr.ceil(start), 0))
@@ -64,13 +68,20 @@ class LeafEmitter:
     it on from there; None for light of their own.
     """
 
-    def __init__(self, problem, power, total, numbering, landings=None):
+    def __init__(
+        self,
+        problem: Problem,
+        power: "Sequence[mi.Float64]",
+        total: float,
+        numbering: Callable,
+        landings: Landings | None = None,
+    ) -> None:
         self.elements, self.leaves = problem.elements, problem.elements.leaves
         self._rays, self._exposure, self._landings = problem.model.rays, problem.exposure, landings
         self._power, self._numbering = power, numbering
         self._distribution = Distribution(power[0] + power[1] + power[2], total)
 
-    def batches(self, count, iteration, seed):
+    def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
         """``count`` rays as Batches."""
         seed, iteration = opaque_index(seed), opaque_index(iteration)
         jitter = uniform(iteration, seed ^ 0x5EED)
@@ -101,10 +112,10 @@ class LeafEmitter:
 class LampEmitter:
     """Sends the power of a lamp that is no surface."""
 
-    def __init__(self, light):
+    def __init__(self, light: Light) -> None:
         self._light = light
 
-    def batches(self, count, iteration, seed):
+    def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
         """``count`` rays as Batches."""
         for ray in launches(count):
             origin, direction, power = self._light.shoot(*kronecker(ray, opaque_index(iteration), opaque_index(seed)))

@@ -1,6 +1,6 @@
 """Facets: what a matrix of view factors has rows for, and what rays from them meet."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +16,13 @@ from ..mesh import Elements
 from ..mesh.exposure import is_covered
 from ..mesh.subdivision import NODES
 from ..scene import Model
+from ..scene.rays import Hit
 
 LEVELS = ("shape", "face", "leaf")
 OUTSIDE = ("sky", "ground", "backs")  # where rays end that meet no facet
+STRAY = NONE - 1  # where rays end that start next to an edge, behind the neighbour
+CRACK = 2.0**-6  # of the way to the middle, from where a neighbour hides no point that lies before it
+NUDGE = 2.0**-16  # by which a neighbouring ray differs in direction
 AT_ONCE = 1 << 22  # rays in one launch: bounds memory, and the time until an interrupt is heard
 
 
@@ -48,7 +52,7 @@ class Facets:
     def __len__(self) -> int:
         return dr.width(self.cells)
 
-    def cell_at(self, hit, active=True):
+    def cell_at(self, hit: Hit, active: "mi.Bool | bool" = True) -> "mi.UInt32":
         """The element that is the cell at hits (UInt32 [n])."""
         return self.elements.leaf_at(hit.patch, hit.u, hit.v, active) if self._to_leaf else hit.patch
 
@@ -57,7 +61,7 @@ class Facets:
         faces, patches = self.model.faces, self.model.patches
         face, back = np.array(patches.face)[patch], np.array(patches.back)[patch].astype(np.int64)
         shape, number = faces.shape[face], face - np.searchsorted(faces.shape, faces.shape[face])
-        ids = [s.id() for s in faces.scene.shapes()]
+        ids = [_identity(faces.scene, part) for part in faces.parts]
         first = np.full(len(ids), len(faces))
         np.minimum.at(first, faces.shape, faces.rank)
         order = sorted(range(len(ids)), key=lambda k: (ids[k], first[k]))
@@ -85,6 +89,12 @@ class Facets:
         return corners
 
 
+def _identity(scene, part):
+    """The id of a shape, behind that of the instance that places it, if there is one."""
+    own = part.shape.id()
+    return own if part.to_world is None else f"{scene.shapes()[part.number].id() or part.number}.{own}"
+
+
 def _name(shape, *rest):
     """A row in words: numbers of the face and the leaf, and the side between them."""
     if len(rest) == 1:
@@ -96,7 +106,7 @@ def _name(shape, *rest):
 class Counts:
     """What the rays of every cell met, in whole numbers."""
 
-    cast: np.ndarray  # rays of the cells [cells]
+    cast: np.ndarray  # rays of the cells, without strays [cells]
     kept: np.ndarray  # ... without those that start under other faces or inside solids [cells]
     met: Any  # how many rays of i met j (SciPy CSR [cells, cells])
     outside: np.ndarray  # how many went elsewhere [cells, OUTSIDE]
@@ -125,6 +135,7 @@ def count_rays(
     outside = np.column_stack([ended(n + k) for k in range(len(OUTSIDE))])
     starts = np.searchsorted(cell[on], np.arange(n + 1)).astype(np.int32)
     matrix = sparse.csr_array((count[on], met[on].astype(np.int32), starts), (n, n))
+    cast = cast - ended(STRAY)
     return Counts(cast, cast - ended(NONE), matrix, outside)
 
 
@@ -140,7 +151,7 @@ def _added_up(keys, count=None):
     return keys[first], number.astype(np.int32)
 
 
-def _casts(facets, cast, seed, up, progress) -> Iterator[np.ndarray]:
+def _casts(facets, cast, seed, up, progress):
     """Cell · 2³² + the cell met, or cells + a number of OUTSIDE, or NONE for rays that go nowhere (uint64 [rays])."""
     ends, total = np.cumsum(cast), int(cast.sum())
     last, first = owned(mi.UInt32, ends), owned(mi.UInt32, ends - cast)
@@ -160,17 +171,38 @@ def _ends(facets, cell, numbers, up):
     elements, rays, (x, y, s, t) = facets.elements, facets.model.rays, numbers
     element = dr.gather(mi.UInt32, facets.cells, cell)
     patch, (u, v) = dr.gather(mi.UInt32, elements.patch, element), elements.patch_point(element, *triangle(x, y))
-    origin, direction = rays.leave(patch, u, v, s, t)
-    hit = rays.trace(origin, direction)
+    met = _met(facets, *rays.leave(patch, u, v, s, t), up)
+    met = dr.select(rays.on_top(patch, u, v), met, NONE)
+    dr.eval(met, u, v, s, t)
+    n = len(facets)
+    doubtful = dr.compress((met >= opaque_index(n)) & (met < opaque_index(n + len(OUTSIDE))))
+    if dr.width(doubtful):
+        element, patch = (dr.gather(mi.UInt32, a, doubtful) for a in (element, patch))
+        u, v, s, t = (dr.gather(mi.Float, a, doubtful) for a in (u, v, s, t))
+        origin, direction = rays.leave(patch, u, v, s, t)
+        # Between two faces a ray may slip through: its neighbour does not.
+        end = _met(facets, origin, dr.normalize(direction + NUDGE * (mi.Vector3f(s, t, u) - 0.5)), up)
+        end = dr.select(_in_a_crack(elements, rays, element, patch, u, v), STRAY, end)
+        # Inside a solid: rays that start there go nowhere.
+        backs = dr.compress(end == opaque_index(n + OUTSIDE.index("backs")))
+        if dr.width(backs):
+            inside = [dr.gather(type(a), a, backs) for a in (element, u, v, s, t)]
+            dr.scatter(end, mi.UInt32(NONE), backs, is_covered(elements, rays, *inside))
+        dr.scatter(met, end, doubtful)
+    return met
+
+
+def _met(facets, origin, direction, up):
+    """The cells that rays meet, or cells + a number of OUTSIDE (UInt32 [rays])."""
+    hit = facets.model.rays.trace(origin, direction)
     on = hit.patch != NONE
     met = dr.gather(mi.UInt32, facets.number_of, facets.cell_at(hit, on), on)
     sky, ground, backs = (opaque_index(len(facets) + k) for k in range(len(OUTSIDE)))
-    met = dr.select(on, met, dr.select(hit.valid, backs, dr.select(dr.dot(direction, up) >= 0, sky, ground)))
-    met = dr.select(rays.on_top(patch, u, v), met, NONE)
-    dr.eval(met, u, v, s, t)
-    doubtful = dr.compress(met == backs)
-    if dr.width(doubtful):  # they may start inside a solid, and then go nowhere
-        u, v, s, t = (dr.gather(mi.Float, a, doubtful) for a in (u, v, s, t))
-        covered = is_covered(elements, rays, dr.gather(mi.UInt32, element, doubtful), u, v, s, t)
-        dr.scatter(met, mi.UInt32(NONE), doubtful, covered)
-    return met
+    return dr.select(on, met, dr.select(hit.valid, backs, dr.select(dr.dot(direction, up) >= 0, sky, ground)))
+
+
+def _in_a_crack(elements, rays, element, patch, u, v):
+    """Do points, lifted off their elements, lie behind a neighbour (Bool [n])? Seen from a little nearer the middle."""
+    middle = elements.patch_point(element, mi.Float(1 / 3), mi.Float(1 / 3))
+    near = (x + CRACK * (y - x) for x, y in zip((u, v), middle))
+    return rays.blocked(elements.patches.above(patch, *near), elements.patches.above(patch, u, v))

@@ -17,7 +17,7 @@ from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
 from ..mesh import Elements, Tree
 from ..scene import Model
 from .contour import exchange_area
-from .facets import AT_ONCE, OUTSIDE, Counts, Facets, count_rays
+from .facets import AT_ONCE, OUTSIDE, Facets, count_rays
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
 FEW = 8  # rays between two cells that lines are worth
@@ -113,7 +113,9 @@ def view_factors(
     model = scene if isinstance(scene, Model) else Model(scene, lit=False)
     if level == "leaf" and elements is None:
         raise RadiosityError("a scene has no leaves before it is solved: ask its solution, or choose level='face'")
-    facets = Facets(model, Tree(model.patches, model.materials).freeze() if elements is None else elements, level)
+    facets = Facets(
+        model, Tree(model.patches, model.materials, model.lights).freeze() if elements is None else elements, level
+    )
     counts = count_rays(facets, int(rays), seed, up, lambda done, total: report("trace", done, total))
     flow = _Exchange(facets, counts, seed, lambda done, total: report("connect", done, total))
     return _closed(facets, counts, flow, start)
@@ -122,7 +124,7 @@ def view_factors(
 class _Exchange:
     """Exchange areas A_i F_ij: a symmetric SciPy CSR ``area`` [cells, cells], and the ``variance`` of its data."""
 
-    def __init__(self, facets, counts: Counts, seed, progress):
+    def __init__(self, facets, counts, seed, progress) -> None:
         self.facets, self.progress = facets, progress
         self.seed = opaque_index(stream_seed(seed, Stream.FACTORS, 1))
         self.density = counts.cast / facets.area  # rays per m²
@@ -223,12 +225,12 @@ class _Exchange:
         i, j = dr.gather(mi.UInt32, i, of), dr.gather(mi.UInt32, j, of)
         x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
         i, j = dr.gather(mi.UInt32, e.patch, i), dr.gather(mi.UInt32, e.patch, j)
-        k = unblocked_kernel(p, i, x, j, y) * dr.gather(mi.Float, unit, of)
+        k = _unblocked_kernel(p, i, x, j, y) * dr.gather(mi.Float, unit, of)
         seen = dr.select(rays.kernel(i, *x, j, *y) > 0, k, 0)
         return k, k * k, seen, seen * seen
 
 
-def unblocked_kernel(patches, i, x, j, y):
+def _unblocked_kernel(patches, i, x, j, y):
     """cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n])."""
     d = patches.point(j, *y) - patches.point(i, *x)
     n_i, n_j = (dr.gather(mi.Vector3f, patches.normal, k) for k in (i, j))
@@ -240,7 +242,7 @@ def unblocked_kernel(patches, i, x, j, y):
 # ---- From exchange areas to a matrix -----------------------------------------------------------------
 
 
-def _closed(facets, counts, flow, start) -> ViewFactors:
+def _closed(facets, counts, flow, start):
     """The matrix of the rows, closed."""
     n, row = len(facets.names), facets.row
     X, V = flow.rows(n)

@@ -1,55 +1,137 @@
 """Light gathered where it is asked for: lines to the lamps, and rays into the solved room."""
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE, Distribution, totals
+from ..core.arrays import NONE
 from ..core.points import triangle
+from ..mesh import Elements, Exposure
+from ..scene import Model
+from .lamps import LampChoice
+from .landings import Landings
+
+
+@dataclass
+class Places:
+    """Points that look for light, [n]; relative to the patches' origin. ``leaf``: elements they lie on, if known."""
+
+    x: "mi.Point3f"
+    normal: "mi.Vector3f"
+    leaf: "mi.UInt32 | None" = None
 
 
 class Gatherer:
     """Irradiance at points of a scene whose radiosity is known.
 
-    reflected: ρ H of the elements (Color3f [elements], W/m²). Points are relative to the patches' origin; each sample
-    is one line to the lamps, or one cosine-distributed ray, and its value an unbiased estimate.
+    reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses
+    a leaf that light is. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
+    an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
+    so that no estimate exceeds their exitance however near they are.
     """
 
-    def __init__(self, model, elements, reflected):
+    def __init__(
+        self, model: Model, elements: Elements, exposure: Exposure, landings: Landings, reflected: "mi.Color3f"
+    ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
-        patches = model.patches
-        self._lamps = dr.compress(dr.max(patches.emission) > 0)
+        self._exposure, self._landings = exposure, landings
+        self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
-        if dr.width(self._lamps) == 0:
-            return
-        emission = dr.gather(mi.Color3f, patches.emission, self._lamps)
-        power = mi.Float64(dr.sum(emission) * dr.gather(mi.Float, patches.area, self._lamps))
-        self._choice = Distribution(power, totals([power])[0])
 
-    def direct(self, x, normal, lot, s, t, active=True):
-        """H from the lamps: E F / p along a line to a point of a lamp that ``lot`` draws by power (Color3f [n])."""
+    def lines(
+        self,
+        places: Places,
+        lot: "mi.Float",
+        s: "mi.Float",
+        t: "mi.Float",
+        rays_per_line: float = 0.0,
+        active: "mi.Bool | bool" = True,
+    ) -> "mi.Color3f":
+        """H from the lamps along lines to points of them (Color3f [n]): E F / (p + c F), p the density of the point.
+
+        lot, s, t: uniform numbers that draw a lamp and a point of it; rays_per_line: c, how many `rays` there are per
+        line, which find lamps as well.
+        """
+        x, normal, rays = places.x, places.normal, self._model.rays
         total = mi.Color3f(0)
-        if dr.width(self._lamps):
-            total += self._from_surfaces(x, normal, lot, s, t, active)
+        if self._lamps.count:
+            lamp, density = self._lamps.draw(lot, places.leaf)
+            u, v = triangle(s, t)
+            F = rays.kernel_at(x, normal, lamp, u, v, active)
+            shared = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
+            total += self._emission(lamp, u, v, F > 0) * (F / (density + shared))
         for light in self._free:
-            direction, distance, irradiance = light.sample(x + self._model.patches.origin, s, t)
-            cosine = dr.dot(direction, normal)
-            lit = active & (cosine > 0)
-            start = x + normal * self._model.patches.lift
-            hidden = self._model.rays.blocked(start, start + direction * distance, lit)
-            total += dr.select(lit & ~hidden, irradiance * cosine, 0)
+            total += light.lights_up(rays, x, normal, s, t, active)
         return total
 
-    def _from_surfaces(self, x, normal, lot, s, t, active):
-        patches = self._model.patches
-        number = self._choice.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._choice.whole))
-        lamp = dr.gather(mi.UInt32, self._lamps, number)
-        F = self._model.rays.kernel_at(x, normal, lamp, *triangle(s, t), active)
-        weight = F * dr.gather(mi.Float, patches.area, lamp) / mi.Float(self._choice.probability(number))
-        return dr.gather(mi.Color3f, patches.emission, lamp) * weight
+    def rays(
+        self,
+        places: Places,
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        rays_per_line: float | None = None,
+        active: "mi.Bool | bool" = True,
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
+        """H from the room, and H from the lamps, that cosine-distributed rays meet (two Color3f [n]).
 
-    def indirect(self, origin, direction, active=True):
-        """H from the room: the reflected radiosity that a cosine-distributed ray meets (Color3f [n])."""
-        hit = self._model.rays.trace(origin, direction, active)
+        number: UInt32 [n], seed: UInt32, what rays draw lobes by. rays_per_line: see `lines`; without lines, None.
+        What rays meet behind lobes that are traced shines by itself, too.
+        """
+        model, patches = self._model, self._model.patches
+        origin = places.x + patches.origin + places.normal * patches.lift
+        hit = model.rays.follow(origin, direction, number, seed, active=active)
         met = active & (hit.patch != NONE)
-        leaf = self._elements.leaf_at(hit.patch, hit.u, hit.v, met)
-        return dr.gather(mi.Color3f, self._reflected, leaf, met)
+        H = self._looked_up(hit, met)
+        emission = model.lights.seen(patches, hit, met)
+        if model.rays.lobes is None:
+            return H, emission * self._share_of_rays(places, hit, met, rays_per_line)
+        straight = met & ~hit.bounced
+        lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
+        seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
+        sky = model.lights.sky(hit.direction, active & hit.bounced & ~hit.valid)
+        return dr.select(active, hit.glow + hit.weight * (H + seen + sky), 0), lamp
+
+    def _emission(self, patch, u, v, active):
+        """E at points of lamps (Color3f [n])."""
+        lights, patches = self._model.lights, self._model.patches
+        if not lights.textured:
+            return dr.gather(mi.Color3f, patches.emission, patch)
+        return lights.exitance_at(dr.gather(mi.UInt32, patches.face, patch), u, v, active)
+
+    def _looked_up(self, hit, met):
+        """ρ H where rays end, 0 behind walls that keep the light of their leaf from them (Color3f [n])."""
+        e = self._elements
+        leaf = e.leaf_at(hit.patch, hit.u, hit.v, met)
+        H = dr.gather(mi.Color3f, self._reflected, leaf, met)
+        if self._landings.slots == 0:
+            return H
+        slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, met)
+        landed = self._landings.any_on(slot, met)
+        x = e.patches.above(dr.select(met, hit.patch, 0), hit.u, hit.v)
+        return dr.select(landed & ~self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed), 0, H)
+
+    def _share_of_rays(self, places, hit, met, rays_per_line):
+        """The balance heuristic's weight of rays that meet lamps, c F / (p + c F) (Float [n])."""
+        if rays_per_line is None:
+            return mi.Float(1)
+        if self._lamps.count == 0:
+            return mi.Float(0)
+        patches = self._model.patches
+        density = self._lamps.density(hit.patch, places.leaf, met)
+        patch = dr.select(met, hit.patch, 0)
+        d = patches.point(patch, hit.u, hit.v) - places.x
+        r2 = dr.squared_norm(d)
+        # F times π r⁴, so that nothing is divided by a small distance.
+        n = dr.gather(mi.Vector3f, patches.normal, patch)
+        F = rays_per_line * dr.maximum(dr.dot(places.normal, d), 0) * dr.maximum(-dr.dot(n, d), 0)
+        found = met & (density > 0) & self._is_met_by_rays(patch)
+        return dr.select(found, F / (density * (dr.pi * r2 * r2) + F), 0)
+
+    def _is_met_by_rays(self, patch):
+        """Do rays end on these lamps, and not go on through them (Bool [n])?"""
+        materials = self._model.materials
+        if not materials.traced.any():
+            return mi.Bool(True)
+        return ~materials.is_traced(dr.gather(mi.UInt32, self._model.patches.face, patch))

@@ -2,9 +2,12 @@
 
 import drjit as dr
 import mitsuba as mi
+from numpy.typing import ArrayLike
 
-from ..core.arrays import owned
+from ..core.arrays import NONE, owned
 from ..core.points import hash_pair
+from ..mesh import Elements
+from ..scene.rays import Rays
 
 SEATS = 16  # points kept per leaf; a power of two
 
@@ -15,13 +18,13 @@ class Landings:
     u, v: patch coordinates (Float [slots · SEATS]), NaN where no light came down.
     """
 
-    def __init__(self, slots, u=None, v=None):
+    def __init__(self, slots: int, u: "ArrayLike | None" = None, v: "ArrayLike | None" = None) -> None:
         self.slots = slots
         nowhere = dr.full(mi.Float, dr.nan, SEATS * slots)
         self.u, self.v = (mi.Float(nowhere) if x is None else owned(mi.Float, x) for x in (u, v))
         self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * slots)
 
-    def offer(self, slot, u, v, number, active):
+    def offer(self, slot: "mi.UInt32", u: "mi.Float", v: "mi.Float", number: "mi.UInt32", active: "mi.Bool") -> None:
         """Rays of a ``number`` each (UInt32 [n]) meet the points (u, v) of crossed leaves."""
         if self.slots == 0:
             return
@@ -39,7 +42,7 @@ class Landings:
             dr.scatter(points, dr.gather(mi.Float, x, offer), seat, drawn)
         dr.eval(self.u, self.v)
 
-    def settled(self):
+    def settled(self) -> "Landings":
         """These landings, seats that were left empty shared with those that were not."""
         if self.slots == 0:
             return self
@@ -54,8 +57,37 @@ class Landings:
             step *= 2
         return result
 
-    def points(self, slot, number, active=True):
-        """Patch points of crossed leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light came
-        down (two Float [n])."""
+    def points(
+        self, slot: "mi.UInt32", number: "mi.UInt32", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Float, mi.Float]":
+        """Patch points of crossed leaves, another for every ``number`` (UInt32 [n]) below SEATS; NaN where no light
+        came down (two Float [n])."""
         seat = SEATS * slot + number % SEATS
         return tuple(dr.gather(mi.Float, x, seat, active) for x in (self.u, self.v))
+
+    def any_on(self, slot: "mi.UInt32", active: "mi.Bool | bool") -> "mi.Bool":
+        """Did light come down on crossed leaves of these slots, NONE for other leaves (Bool [n])?"""
+        if self.slots == 0:
+            return mi.Bool(False)
+        asked = active & (slot != NONE)
+        return asked & ~dr.isnan(self.points(slot, mi.UInt32(0), asked)[0])
+
+    def in_sight(
+        self,
+        elements: Elements,
+        rays: Rays,
+        leaf: "mi.UInt32",
+        slot: "mi.UInt32",
+        x: "mi.Point3f",
+        active: "mi.Bool | bool",
+    ) -> "mi.Bool":
+        """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
+        patch = dr.gather(mi.UInt32, elements.patch, leaf, active)
+
+        def look(found, k):
+            u, v = self.points(slot, k, active)
+            asked = active & ~found
+            return found | (asked & ~rays.blocked(x, elements.patches.above(patch, u, v), asked)), k + 1
+
+        found = mi.Bool(active & False)
+        return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]

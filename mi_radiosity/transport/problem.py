@@ -47,6 +47,6 @@ class Flow:
     first_share: float  # of the power shot in all, the lamps' part
     emitted: list[float]
     escaped: list[float]
-    blocked: list[float]  # absorbed by sides that reflect nothing
+    blocked: list[float]  # absorbed by sides that reflect nothing, and by lobes that are traced
     unshot: list[float]
     records: tuple[Record, ...] = ()

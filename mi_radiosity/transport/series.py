@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE, totals
-from ..core.points import hash_pair
+from ..core.arrays import NONE, opaque_index, totals
+from ..core.points import Stream, hash_pair, stream_seed
 from ..mesh.hierarchy import pull, push
-from .deposit import pair_of, spread, trusted
+from .deposit import pair_of, spread, straight, trusted
 from .emit import LampEmitter, LeafEmitter, numbered_by_leaf, numbered_through
 from .landings import Landings
 from .problem import Flow, Problem, Record
@@ -57,7 +57,14 @@ class Shooting(Transport):
     deposit: Callable = trusted
     records: bool = False
 
-    def __call__(self, problem, rays, seed, first_share=0.5, progress=lambda done: None):
+    def __call__(
+        self,
+        problem: Problem,
+        rays: int,
+        seed: int,
+        first_share: float = 0.5,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Flow:
         series = _Series(self, problem, rays, seed, first_share)
         while series.left > 0 and sum(series.unshot) > 0:
             series.iterate(progress)
@@ -70,7 +77,7 @@ PILOT = Shooting(tail=0.1, numbering=numbered_by_leaf, deposit=spread, records=T
 class _Series:
     """One run of Shooting."""
 
-    def __init__(self, how, problem, rays, seed, first_share):
+    def __init__(self, how: Shooting, problem: Problem, rays: int, seed: int, first_share: float) -> None:
         self.how, self.problem, self.seed, self.rays = how, problem, seed, rays
         elements, area = problem.elements, problem.exposure.open_area
         self.area = mi.Float64(dr.gather(mi.Float, area, elements.leaves))
@@ -94,7 +101,7 @@ class _Series:
         tally = self._shoot(count, progress)
         self.left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
-        scale = [u / s if s > 0 else 0.0 for u, s in zip(self.unshot, tally.totals())]
+        scale = [u / s if s > 0 else 0.0 for u, s in zip(self.unshot, tally.sent())]
         received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
         received = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
         dr.eval(received)
@@ -103,7 +110,8 @@ class _Series:
         closes = self.left == 0
         closure = [1 / max(1 - a / u, 1e-6) if closes and u > 0 else 1.0 for a, u in zip(after, self.unshot)]
         self._add(received, closure)
-        for lost, which in ((self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED)):
+        bins = (self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED), (self.blocked, Tally.TAKEN)
+        for lost, which in bins:
             lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
         self.shot += sum(u * c for u, c in zip(self.unshot, closure))
         self.share = 1 - min(sum(after) / sum(self.unshot), 0.999)
@@ -133,7 +141,8 @@ class _Series:
 
     def _shoot(self, count, progress):
         """Cast ``count`` rays and tally what arrives where."""
-        tally, landings = Tally(len(self.problem.elements), self.unshot), Landings(self.problem.exposure.slots)
+        tally = Tally(len(self.problem.elements), self.unshot, self.problem.model.rays.lobes is not None)
+        landings = Landings(self.problem.exposure.slots)
         cast = self.rays - self.left
         for emitter, share in self._emitters(count):
             for batch in emitter.batches(share, self.iteration, self.seed):
@@ -145,14 +154,17 @@ class _Series:
 
     def _cast(self, batch, tally, landings):
         problem = self.problem
-        hit = problem.model.rays.trace(batch.origin, batch.direction)
+        seed = opaque_index(stream_seed(self.seed, Stream.LOBES, self.iteration))
+        hit = problem.model.rays.follow(batch.origin, batch.direction, batch.number, seed, power=True)
         pair = pair_of(problem, batch, hit)
         receiver = self.how.deposit(problem, hit, pair)
         on_patch = hit.patch != NONE
         # Rays that start inside a solid go nowhere; the others of their element carry their power.
-        tally.add(batch.power, hit, receiver, batch.starts & (~batch.doubtful | on_patch | ~hit.valid))
+        goes = ~batch.doubtful | on_patch | ~hit.valid | hit.traced
+        tally.add(batch, hit, receiver, batch.starts & goes)
         if self.how.records:
-            record = Record(hit.patch, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)
+            met = dr.select(straight(batch, hit), hit.patch, NONE)
+            record = Record(met, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)
             dr.eval(record.i, record.ui, record.vi, record.j, record.uj, record.vj, record.pair)
             self.records.append(record)
         if landings.slots:

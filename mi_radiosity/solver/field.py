@@ -1,5 +1,7 @@
 """Irradiance as a continuous field over each flat or smooth surface (Gouraud)."""
 
+from typing import Any  # a Solution has a Field
+
 import drjit as dr
 import mitsuba as mi
 
@@ -7,7 +9,6 @@ from ..core.arrays import NONE, ColorSums, totals
 from ..mesh.exposure import node_point
 from ..mesh.subdivision import HALF_SIDES, child_at, child_corner, child_point
 from ..mesh.vertices import Vertices
-from ..transport.landings import SEATS
 
 FAINT = 1e-4  # weight below which a node has no say
 SHARPEN = 1  # rounds in which vertices make up for what averaging took from the elements
@@ -23,45 +24,53 @@ class Field:
     Where a wall stands on a leaf, each side of it is shown by the nodes on that side that light came down in sight
     of; and where there is none, by the leaf's own value if light came down in sight of the point itself.
 
-    nodes: six Color3f per element, [6 · elements], NaN for those that nothing is known of.
+    irradiance: of the elements (Color3f [elements]), by default all of the solution's.
+    vertices: the Vertices of the mesh, with values (Color3f [vertices]). nodes: six Color3f per element,
+    [6 · elements]. NaN for those that nothing is known of.
     """
 
-    def __init__(self, solution):
+    def __init__(self, solution: Any, irradiance: "mi.Color3f | None" = None) -> None:
         self._solution, self._elements = solution, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
-        self.flat = solution.direct + solution.indirect
+        self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
         leaves = self._elements.leaves
         H = dr.gather(mi.Color3f, self.flat, leaves)
-        self._vertices = Vertices(solution.model, self._elements)
-        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0)
+        self.vertices = Vertices(solution.model, self._elements)
+        self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0) | self._nodes_behind_walls(leaves)
         values = self._spread(H)
         for _ in range(SHARPEN):
             lost = dr.select(self._dark_nodes == 0, H - self._mean(values), 0)
             values = dr.maximum(values + self._spread(lost), 0)
-        self._store(self._straightened(values))
+        self.values = self._straightened(values)
+        self._store(self.values)
 
     def _store(self, values):
         n, leaves = len(self._elements), self._elements.leaves
         self.nodes, self._points = dr.full(mi.Color3f, dr.nan, 6 * n), dr.zeros(mi.Point3f, 6 * n)
-        points = self._vertices.nodes(self._vertices.point, self._half_way)
+        points = self.vertices.nodes(self.vertices.point, self._half_way)
         for k, (color, point) in enumerate(zip(self._node_values(values), points)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
             dr.scatter(self._points, point, 6 * leaves + k)
-        self._walled = mi.Bool(self._exposure.crossed)
+        self._walled = dr.zeros(mi.Bool, n)
         walled = dr.full(mi.Bool, False, dr.width(leaves))
         for a, b in HALF_SIDES:  # both leaves of a side find the same
             walled |= self._rays.blocked(points[a], points[b], ~walled)
-        dr.scatter(self._walled, walled | dr.gather(mi.Bool, self._exposure.crossed, leaves), leaves)
+        dr.scatter(self._walled, walled | (self._dark_nodes != 0), leaves)
         dr.eval(self.nodes, self._points, self._walled)
 
     @property
-    def walled(self):
+    def walled(self) -> "mi.Bool":
         """Which leaves does a wall stand on (Bool [elements])?"""
         return self._walled
 
+    @property
+    def of_leaves(self) -> "mi.Color3f":
+        """H of the leaves themselves (Color3f [leaves])."""
+        return dr.gather(mi.Color3f, self.flat, self._elements.leaves)
+
     # ---- Looking up ----------------------------------------------------------------------------
 
-    def at(self, leaf, u, v, active=True):
+    def at(self, leaf: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """H at patch points (u, v) on leaves (Color3f [n])."""
         e = self._elements
         a, b = e.own_point(leaf, u, v, active)
@@ -89,27 +98,10 @@ class Field:
             return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
         own = dr.gather(mi.Color3f, self.flat, leaf, active)
-        landed = self._has_landings(slot, active)
-        return dr.select(self._light_in_sight(leaf, slot, x, landed), own, dr.select(landed, 0, total))
-
-    def _has_landings(self, slot, active):
-        """Did light come down on crossed leaves of these slots (Bool [n])?"""
-        landings, asked = self._solution.landings, active & (slot != NONE)
-        return asked & ~dr.isnan(landings.points(slot, mi.UInt32(0), asked)[0])
-
-    def _light_in_sight(self, leaf, slot, x, active):
-        """Did light come down on crossed leaves, of these slots, in sight of points x of them (Bool [n])?"""
-        e, landings = self._elements, self._solution.landings
-        patch = dr.gather(mi.UInt32, e.patch, leaf, active)
-
-        def look(found, k):
-            u, v = landings.points(slot, k, active)
-            return found | (
-                active & ~found & ~self._rays.blocked(x, e.patches.above(patch, u, v), active & ~found)
-            ), k + 1
-
-        found = mi.Bool(active & False)
-        return dr.while_loop((found, mi.UInt32(0)), lambda found, k: active & ~found & (k < SEATS), look)[0]
+        landings = self._solution.landings
+        landed = landings.any_on(slot, active)
+        seen = landings.in_sight(self._elements, self._rays, leaf, slot, x, landed)
+        return dr.select(seen, own, dr.select(landed, 0, total))
 
     # ---- Building ------------------------------------------------------------------------------
 
@@ -118,17 +110,34 @@ class Field:
         dark = dr.zeros(mi.UInt32, dr.width(leaves))
         if self._solution.landings.slots == 0:
             return dark
-        chosen = dr.compress(self._has_landings(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
+        landings = self._solution.landings
+        chosen = dr.compress(landings.any_on(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
         if dr.width(chosen) == 0:
             return dark
         leaf, bits = dr.gather(mi.UInt32, leaves, chosen), mi.UInt32(0)
         slot, every = dr.gather(mi.UInt32, self._exposure.slot, leaf), dr.full(mi.Bool, True, dr.width(leaf))
         for node in range(6):
-            seen = self._light_in_sight(leaf, slot, node_point(self._elements, leaf, node), every)
+            point = node_point(self._elements, leaf, node)
+            seen = landings.in_sight(self._elements, self._rays, leaf, slot, point, every)
             bits |= dr.select(seen, mi.UInt32(0), 1 << node)
         dr.scatter(dark, bits, chosen)
         dr.eval(dark)
         return dark
+
+    def _nodes_behind_walls(self, leaves):
+        """Nodes of leaves whose vertex stands on the other side of a wall, where leaves of one plane meet, a bit for
+        each (UInt32 [leaves])."""
+        patches, bits = self._elements.patches, dr.zeros(mi.UInt32, dr.width(leaves))
+        normal = dr.gather(mi.Vector3f, patches.normal, dr.gather(mi.UInt32, self._elements.patch, leaves))
+        for node, vertex in enumerate((*self.vertices.corner, *self.vertices.middle)):
+            index = dr.gather(mi.UInt32, vertex, leaves)
+            there = dr.gather(mi.Point3f, self.vertices.point, index, index != NONE)
+            here = node_point(self._elements, leaves, node)
+            level = (index != NONE) & (dr.abs(dr.dot(there - here, normal)) < 0.25 * patches.lift)
+            hidden = self._rays.blocked(here, there, level)
+            bits |= dr.select(hidden, mi.UInt32(1 << node), 0)
+        dr.eval(bits)
+        return bits
 
     def _spread(self, H):
         """Vertex values from leaf values: averages over the leaves around (Color3f [vertices]).
@@ -136,7 +145,7 @@ class Field:
         A leaf counts by its angle at the vertex over its size, which is right for linear fields next
         to a hanging vertex, and by the share of it that is open; not at all at vertices away from its light.
         """
-        e, v = self._elements, self._vertices
+        e, v = self._elements, self.vertices
         area = dr.gather(mi.Float, e.area, e.leaves)
         size, share = dr.sqrt(area), self._exposure.open_share(e, e.leaves)
         bound = [2 * t for t in totals([mi.Float64(dr.abs(h)) / mi.Float64(size) * 16 for h in H])]
@@ -157,7 +166,7 @@ class Field:
 
     def _straightened(self, values):
         """``values`` with hanging vertices on the line between the ends of their side."""
-        for vertex, low, high in self._vertices.straight:
+        for vertex, low, high in self.vertices.straight:
             dr.scatter(values, self._between(values, low, high, True), vertex)
             dr.eval(values)
         return values
@@ -166,7 +175,7 @@ class Field:
         """The value in the middle of straight sides: the mean of the ends, or that of the one that is in sight, and
         known of (Color3f [n])."""
         a, b = (dr.gather(mi.Color3f, values, end) for end in (low, high))
-        start, end = (dr.gather(mi.Point3f, self._vertices.point, k) for k in (low, high))
+        start, end = (dr.gather(mi.Point3f, self.vertices.point, k) for k in (low, high))
         middle = 0.5 * (start + end)
         no_a, no_b = (self._rays.blocked(middle, x, active) for x in (start, end))
         # NaN where the only end in sight is one that nothing is known of.
@@ -174,12 +183,12 @@ class Field:
 
     def _half_way(self, low, high, active):
         return 0.5 * (
-            dr.gather(mi.Point3f, self._vertices.point, low) + dr.gather(mi.Point3f, self._vertices.point, high)
+            dr.gather(mi.Point3f, self.vertices.point, low) + dr.gather(mi.Point3f, self.vertices.point, high)
         )
 
     def _node_values(self, values):
         """The six node values of every leaf (six Color3f [leaves])."""
-        return self._vertices.nodes(values, lambda low, high, active: self._between(values, low, high, active))
+        return self.vertices.nodes(values, lambda low, high, active: self._between(values, low, high, active))
 
     def _mean(self, values):
         """Mean of the displayed field over each leaf (Color3f [leaves])."""

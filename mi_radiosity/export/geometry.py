@@ -1,0 +1,231 @@
+"""The lit mesh: welded triangles of a solution, for whoever shows them without this package."""
+
+from dataclasses import dataclass, fields
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import owned
+from ..mesh.subdivision import NODES
+from ..scene.materials import is_diffuse, is_textured
+from ..scene.tessellate import Part
+from ..solver import Solution
+from ..solver.field import Field
+from .cutting import cut, sides_of
+from .walls import beside_walls
+
+APART = 0.02  # how far, relatively, a value beside a wall may be from that of its vertex and still be welded to it
+
+RAISE = 1e-4  # of the diagonal of its box: how far apart a mesh has sides in one plane on screens
+
+
+@dataclass(frozen=True)
+class LitMesh:
+    """Triangles with the Gouraud field of a solution at their vertices; NumPy arrays, one row each.
+
+    A leaf is one triangle, or is cut at the vertices that hang on its sides, so that triangles of one surface meet
+    along whole sides. Vertices are shared within a side of a shape, where they share a shading normal, a texture's
+    coordinates and, beside walls, their light. Triangles are counter-clockwise as seen from the side that is lit.
+    """
+
+    vertices: np.ndarray  # [vertices, 3] m, in the coordinates of the scene
+    triangles: np.ndarray  # [triangles, 3] numbers of vertices
+    direct: np.ndarray  # [vertices, 3] irradiance from the lamps' first flight, W/m²
+    indirect: np.ndarray  # [vertices, 3] from all later ones
+    reflectance: np.ndarray  # [vertices, 3] ρ, the mean over the leaves around
+    emission: np.ndarray  # [vertices, 3] E, W/m²
+    uv: np.ndarray  # [vertices, 2] coordinates of the shape's texture, NaN where it has none
+    leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution, −1 where no light comes
+    shape: np.ndarray  # [triangles] number of the shape among the parts of the scene, model.faces.parts
+    back: np.ndarray  # [triangles] bool: the back of the shape
+    above: np.ndarray  # [triangles] how many lit sides lie in the same plane below it
+
+    @property
+    def irradiance(self) -> np.ndarray:
+        """H, W/m² [vertices, 3]."""
+        return self.direct + self.indirect
+
+    @property
+    def radiosity(self) -> np.ndarray:
+        """B = E + ρ H, W/m² [vertices, 3]."""
+        return self.emission + self.reflectance * self.irradiance
+
+    @property
+    def size(self) -> float:
+        """The diagonal of the box around it, m."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    def raised(self, by: float) -> np.ndarray:
+        """``vertices``, those of triangles ``above`` others lifted off the plane, m for each [vertices, 3]."""
+        chosen = self.above > 0
+        corner, above = self.triangles[chosen], self.above[chosen]
+        a, b, c = (self.vertices[corner[:, k]] for k in range(3))
+        normal, height = np.zeros_like(self.vertices), np.zeros(len(self.vertices))
+        for k in range(3):
+            np.add.at(normal, corner[:, k], np.cross(b - a, c - a))
+            np.maximum.at(height, corner[:, k], above)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return self.vertices + by * height[:, None] * normal / np.where(length > 0, length, 1)
+
+    def areas(self) -> np.ndarray:
+        """Areas of the triangles, m² [triangles]."""
+        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def lit_mesh(solution: Solution) -> LitMesh:
+    """The triangles of a solution, with the values of its Gouraud picture, and the opaque faces that no light reaches.
+
+    Mirrors and glass, as far as they have no diffuse lobe, are left out or black: nothing can be baked of them.
+    """
+    mesh, dark = _lit(solution), _dark_faces(solution.model)
+    n, corners = len(dark), solution.model.faces.corners[dark].reshape(-1, 3)
+    black = np.zeros((3 * n, 3))
+    more = LitMesh(
+        corners,
+        np.arange(3 * n).reshape(n, 3) + len(mesh.vertices),
+        black,
+        black,
+        black,
+        black,
+        np.full((3 * n, 2), np.nan),
+        np.full(n, -1),
+        solution.model.faces.shape[dark],
+        np.zeros(n, dtype=bool),
+        np.zeros(n, dtype=np.int64),
+    )
+    return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
+
+
+def name_of(parts: list[Part], number: int) -> str:
+    """How files call a part of a scene."""
+    return parts[number].shape.id() or f"shape-{number}"
+
+
+def _dark_faces(model):
+    """Numbers of opaque faces neither side of which is a patch or lies under one."""
+    faces, known = model.faces, np.zeros(len(model.faces), dtype=bool)
+    known[np.array(model.patches.face)] = True
+    if model.rays.overlaps:
+        known[model.rays.overlaps.under // 2] = True
+    shapes = [part.shape for part in faces.parts]
+    clear = [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes]
+    return np.flatnonzero(~known & ~faces.degenerate & ~np.array(clear)[faces.shape])
+
+
+def _lit(solution):
+    elements, model = solution.elements, solution.model
+    layers = [solution.field, Field(solution, solution.direct)]
+    vertices, leaves = layers[0].vertices, np.array(elements.leaves)
+    corner = np.array(vertices.corner).reshape(3, -1).T
+    pieces, of = cut(corner[leaves].astype(np.int64), sides_of(vertices, elements))
+    table = np.hstack([_points(model, elements, corner, vertices.count), *(_known(f, corner[leaves]) for f in layers)])
+    table, pieces, of, values, beside = beside_walls(solution, layers, table, pieces, of)
+    values[..., 3:] = np.minimum(values[..., 3:], values[..., :3])
+
+    patch = np.array(elements.patch)[leaves[of]]
+    face, back = np.array(model.patches.face)[patch], np.array(model.patches.back).astype(bool)[patch]
+    shape = model.faces.shape[face]
+    uv = _texture_coordinates(model, face, table[pieces, :3])
+    own = beside[:, None] & (np.abs(values - table[pieces, 3:]) > APART * (values + values.mean())).any(axis=2)
+    step = np.round(np.log(values + values.mean() / 100) / APART).astype(np.int64)
+    apart = np.where(own[..., None], step, np.iinfo(np.int64).max).reshape(-1, 6)
+    key = [pieces.ravel(), np.repeat(2 * shape + back, 3), *apart.T, *_rounded(uv)]
+    first, number = _unique(key)
+    number, values = number.reshape(-1, 3), values.reshape(-1, 6)[first]
+    turned = (back ^ model.faces.flipped[face])[:, None]
+    rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(elements.emission(elements.leaves))[of]
+    return LitMesh(
+        vertices=table[pieces.ravel()[first], :3],
+        triangles=np.where(turned, number[:, ::-1], number),
+        direct=values[:, 3:],
+        indirect=values[:, :3] - values[:, 3:],
+        reflectance=_around(number, rho, len(first)),
+        emission=_around(number, emission, len(first)),
+        uv=uv.reshape(-1, 2)[first],
+        leaf=of,
+        shape=shape,
+        back=back,
+        above=_above(model, face, back),
+    )
+
+
+def _above(model, face, back):
+    """How many patches sides of faces lie on; a back lies on its own front."""
+    height, known = np.zeros(2 * len(model.faces), dtype=np.int64), np.zeros(2 * len(model.faces), dtype=bool)
+    known[2 * np.array(model.patches.face) + np.array(model.patches.back).astype(np.int64)] = True
+    height[1::2] = known[::2] & known[1::2]
+    overlaps, before = model.rays.overlaps, None
+    while overlaps and (before is None or (before != height).any()):
+        before, on_patch = height.copy(), known[overlaps.under]
+        np.maximum.at(height, overlaps.over[on_patch], before[overlaps.under[on_patch]] + 1)
+    return height[2 * face + back]
+
+
+def _points(model, elements, corner, count):
+    """Where vertices are [count, 3], in float64: as the first element has them."""
+    patch, faces = np.array(elements.patch), model.faces
+    face = np.array(model.patches.face)[patch]
+    u0, v0, scale = (np.array(x, dtype=np.float64)[:, None] for x in (elements.u0, elements.v0, elements.scale))
+    points = np.empty((count, 3))
+    for k, (a, b) in enumerate(NODES[:3]):
+        at = faces.corners[face, 0] + (u0 + scale * a) * faces.e1[face] + (v0 + scale * b) * faces.e2[face]
+        points[corner[::-1, k]] = at[::-1]
+    return points
+
+
+def _known(field, leaf_corners):
+    """Values of the vertices [vertices, 3]; where nothing is known of one, the mean of the leaves around."""
+    values = _rows(field.values)
+    unknown = np.isnan(values[:, 0])
+    if unknown.any():
+        values[unknown] = _around(leaf_corners, _rows(field.of_leaves), len(values))[unknown]
+    return values
+
+
+def _around(triangles, values, count):
+    """Means, at vertices, of values of the triangles around [count, 3]."""
+    index = triangles.ravel()
+    sums = [np.bincount(index, np.repeat(column, 3), count) for column in values.T]
+    return np.column_stack(sums) / np.maximum(np.bincount(index, minlength=count), 1)[:, None]
+
+
+def _texture_coordinates(model, face, points):
+    """UV of the corners of pieces of faces, where their shapes are textured [pieces, 3, 2]."""
+    faces, uv = model.faces, np.full((len(face), 3, 2), np.nan)
+    textured = [is_textured(p.shape.bsdf()) and is_diffuse(p.shape.bsdf()) for p in faces.parts]
+    for number in np.flatnonzero(textured):
+        chosen = np.flatnonzero(faces.shape[face] == number)
+        of = np.repeat(face[chosen], 3)
+        u, v = barycentric(faces.corners[of], points[chosen].reshape(-1, 3))
+        si = faces.surface(*(owned(kind, x) for kind, x in ((mi.UInt32, of), (mi.Float, u), (mi.Float, v))))
+        uv[chosen] = np.array(si.uv).T.reshape(-1, 3, 2)
+    return uv
+
+
+def barycentric(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) of points [n, 3] in triangles [n, 3, 3] (two float [n])."""
+    e1, e2, x = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], points - corners[:, 0]
+    normal = np.cross(e1, e2)
+    n2 = (normal**2).sum(axis=1)
+    return (np.cross(x, e2) * normal).sum(axis=1) / n2, (np.cross(e1, x) * normal).sum(axis=1) / n2
+
+
+def _unique(columns):
+    """The first row of each kind, in order, and the kind of every row, of a table of integers given by columns."""
+    order = np.lexsort(columns)
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = np.any([column[order][1:] != column[order][:-1] for column in columns], axis=0)
+    first, number = order[new], np.empty(len(order), dtype=np.int64)
+    place = np.argsort(np.argsort(first))
+    number[order] = place[np.cumsum(new) - 1]
+    return np.sort(first), number
+
+
+def _rounded(uv):
+    return list(np.round(np.nan_to_num(uv) * 2**16).astype(np.int64).reshape(-1, 2).T)
+
+
+def _rows(color):
+    """A Color3f as NumPy [n, 3]."""
+    return np.array(color, dtype=np.float64).reshape(3, -1).T

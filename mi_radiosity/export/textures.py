@@ -1,0 +1,71 @@
+"""Textures of shapes as pictures: whatever their reflectance is made of."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..scene.tessellate import Part
+from .geometry import LitMesh
+from .tone import srgb8
+
+FEWEST, MOST = 512, 2048  # pixels along a side
+
+
+@dataclass(frozen=True)
+class Texture:
+    """ρ of a side of a shape over a rectangle of its texture coordinates."""
+
+    image: np.ndarray  # [height, width, 3] ρ, linear; the first row is v = high[1]
+    low: np.ndarray  # [2] the coordinates it spans
+    high: np.ndarray
+
+    def place(self, uv: np.ndarray) -> np.ndarray:
+        """Coordinates of the shape as those of the picture, (0, 0) its upper left corner [n, 2]."""
+        share = (uv - self.low) / (self.high - self.low)
+        return np.column_stack([share[:, 0], 1 - share[:, 1]])
+
+
+def png(linear: np.ndarray) -> bytes:
+    """Linear values in [0, 1] [height, width, 3] as a PNG file in sRGB."""
+    stream = mi.MemoryStream()
+    mi.Bitmap(srgb8(linear)).write(stream, mi.Bitmap.FileFormat.PNG)
+    return bytes(stream.raw_buffer())
+
+
+def textures(mesh: LitMesh, parts: list[Part]) -> dict[tuple[int, bool], Texture]:
+    """The textures of a mesh by shape and side."""
+    found, textured = {}, ~np.isnan(mesh.uv[mesh.triangles[:, 0], 0])
+    for shape, back in sorted(set(zip(mesh.shape[textured].tolist(), mesh.back[textured].tolist()))):
+        part = textured & (mesh.shape == shape) & (mesh.back == back)
+        uv = mesh.uv[np.unique(mesh.triangles[part])]
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        if (high > low).all():
+            found[shape, back] = _bake(parts[shape].shape.bsdf(), back, low, high)
+    return found
+
+
+def _bake(bsdf, back, low, high):
+    size = _resolution(bsdf, high - low)
+    x, y = (k.ravel().astype(np.float32) for k in np.meshgrid(*(np.arange(n) + 0.5 for n in size)))
+    si = dr.zeros(mi.SurfaceInteraction3f, x.size)
+    si.uv = mi.Point2f(
+        *(
+            mi.Float(a)
+            for a in (
+                (low[0] + x / size[0] * (high - low)[0]).astype(np.float32),
+                (high[1] - y / size[1] * (high - low)[1]).astype(np.float32),
+            )
+        )
+    )
+    si.wi = mi.Vector3f(0, 0, -1.0 if back else 1.0)
+    rho = np.array(mi.Color3f(bsdf.eval_diffuse_reflectance(si))).T.reshape(size[1], size[0], 3)
+    return Texture(rho, low, high)
+
+
+def _resolution(bsdf, span):
+    """Width and height in pixels: at least those of the largest bitmap in a BSDF, as often as it is repeated."""
+    bitmaps = [value.shape for name, value in mi.traverse(bsdf) if name.endswith("data") and dr.is_tensor_v(value)]
+    size = np.max(bitmaps, axis=0)[1::-1] if bitmaps else np.array([FEWEST, FEWEST])
+    return tuple(int(n) for n in np.clip(np.ceil(size * span), FEWEST, MOST))

@@ -1,0 +1,110 @@
+"""Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import NONE
+from ..core.points import ROUNDS
+
+ROULETTE = 5  # lobes after which a ray may end by chance
+MOST = 64  # lobes after which it ends
+
+
+@dataclass
+class Trail:
+    """Where rays end that went on through lobes; [rays], like a `Hit`, which it can stand for.
+
+    ``patch`` is NONE for rays that escape (not ``valid``) or end without a diffuse lobe. ``traced`` says that rays met
+    a surface with other lobes than a diffuse one. ``weight``: what is left of a ray at its end; where that surface has
+    other lobes, too, times the weight of the diffuse lobe that was drawn over its mean ρ, so that the mean is right.
+    ``taken``: power that the lobes on the way kept, less what they sent on from surfaces that count all of
+    theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
+    the end included (it is ``coated``), times the weight there, W/m².
+    """
+
+    valid: "mi.Bool"
+    patch: "mi.UInt32"
+    u: "mi.Float"
+    v: "mi.Float"
+    direction: "mi.Vector3f"  # at the end
+    weight: "mi.Color3f"
+    bounced: "mi.Bool"  # it went through a lobe
+    traced: "mi.Bool"
+    coated: "mi.Bool"
+    taken: "mi.Color3f"
+    glow: "mi.Color3f"
+
+
+class Lobes:
+    """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
+
+    def follow(
+        self,
+        rays: Any,
+        ray: "mi.Ray3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        mode: "mi.TransportMode",
+        camera: bool,
+        active: "mi.Bool | bool" = True,
+    ) -> Trail:
+        """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
+
+        mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.
+        camera: the first surface's own light counts, too.
+        """
+        ctx, n = mi.BSDFContext(mode), dr.width(ray.d)
+        random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
+        alive, no = mi.Bool(active) & dr.full(mi.Bool, True, n), dr.zeros(mi.Bool, n)
+        nought, black = dr.zeros(mi.Float, n), dr.zeros(mi.Color3f, n)
+        nowhere = dr.full(mi.UInt32, NONE, n)
+        start = Trail(no, nowhere, nought, nought, mi.Vector3f(ray.d), black + 1, no, no, no, black, black)
+
+        def step(alive, ray, depth, random, trail):
+            return self._step(rays, ctx, camera, alive, ray, depth, random, trail)
+
+        state = (alive, mi.Ray3f(ray), dr.zeros(mi.UInt32, n), random, start)
+        return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
+
+    def _step(self, rays, ctx, camera, alive, ray, depth, random, trail):
+        """One more hit."""
+        prelim = rays.scene.ray_intersect_preliminary(ray, active=alive)
+        hit, before = rays.locate(prelim, ray.d), trail.weight
+        si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, hit.traced)
+        s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        sample, value = si.bsdf(ray).sample(ctx, si, s, st, hit.traced)
+        value = dr.select(hit.traced & dr.isfinite(value), value, 0)
+        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        on_patch = hit.patch != NONE
+        coated = hit.traced & drawn & on_patch & (dr.max(value) > 0)
+        on = hit.traced & ~coated
+
+        shines = hit.traced & on_patch & (trail.bounced | camera)
+        glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines)
+        rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
+        factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
+        # Sides with a diffuse lobe count all that meets them as received, the others nothing.
+        taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
+
+        depth += 1
+        lives = dr.select(on & (depth > ROULETTE), dr.minimum(dr.max(before * factor), 0.95), 1)
+        goes_on = on & (dr.max(before * factor) > 0) & (random.next_float32() < lives) & (depth < MOST)
+        weight = dr.select(on & ~goes_on, 0, before * factor / dr.maximum(lives, 1e-6))
+        trail = Trail(
+            valid=hit.valid,
+            patch=dr.select(on, NONE, hit.patch),
+            u=hit.u,
+            v=hit.v,
+            direction=ray.d,
+            weight=weight,
+            bounced=trail.bounced | on,
+            traced=trail.traced | hit.traced,
+            coated=coated,
+            taken=trail.taken + taken,
+            glow=trail.glow + glow,
+        )
+        ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
+        return goes_on, ray, depth, random, trail

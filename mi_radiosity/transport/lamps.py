@@ -1,0 +1,95 @@
+"""Which lamp to look at: chosen by what each could give here."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import NONE, Distribution, lower_bound_within, opaque_index, totals
+from ..mesh import Elements
+from ..scene import Model
+
+MOST = 1 << 24  # entries of the table of leaves and lamps; with more lamps than that, they are chosen by power
+BY_POWER = 0.1  # share of lines that are drawn by power whatever the place
+
+
+class LampChoice:
+    """Draws points on lamps (patches that emit), for places on the leaves of a mesh.
+
+    A row per leaf holds what every lamp would give its middle were nothing between: a line is worth the more, the more
+    light it may bring. ``count``: how many lamp patches there are.
+    """
+
+    def __init__(self, model: Model, elements: Elements) -> None:
+        self._patches, self._elements = model.patches, elements
+        self.lamps = dr.compress(dr.max(self._patches.emission) > 0)
+        self.count = dr.width(self.lamps)
+        self._rows = None
+        if self.count == 0:
+            return
+        emission = dr.gather(mi.Color3f, self._patches.emission, self.lamps)
+        power = mi.Float64(dr.sum(emission) * dr.gather(mi.Float, self._patches.area, self.lamps))
+        whole = totals([power])[0]
+        self._by_power = Distribution(power, whole)
+        self._number = dr.full(mi.UInt32, NONE, self._patches.count)
+        dr.scatter(self._number, dr.arange(mi.UInt32, self.count), self.lamps)
+        if 1 < self.count and self.count * dr.width(elements.leaves) <= MOST:
+            self._build_rows(mi.Float(power / dr.opaque(mi.Float64, whole)))
+
+    def _build_rows(self, share):
+        """Cumulative shares of all lamps, leaf by leaf (Float [leaves · lamps])."""
+        p, e, leaves = self._patches, self._elements, self._elements.leaves
+        k = dr.arange(mi.UInt32, self.count * dr.width(leaves))
+        row, lamp = k // opaque_index(self.count), k % opaque_index(self.count)
+        leaf, j = dr.gather(mi.UInt32, leaves, row), dr.gather(mi.UInt32, self.lamps, lamp)
+        i, third = dr.gather(mi.UInt32, e.patch, leaf), mi.Float(1 / 3)
+        d = p.point(j, third, third) - p.point(i, *e.patch_point(leaf, third, third))
+        spread = dr.gather(mi.Float, e.area, leaf) + dr.gather(mi.Float, p.area, j)
+        r2 = dr.squared_norm(d)
+        # Cosines of the middle, and what the sizes of both may add to them.
+        slack = dr.sqrt(dr.minimum(spread / dr.maximum(r2, 1e-30), 1))
+        length = dr.sqrt(dr.maximum(r2, 1e-30))
+        here = dr.maximum(dr.dot(dr.gather(mi.Vector3f, p.normal, i), d) / length + slack, 0)
+        there = dr.maximum(-dr.dot(dr.gather(mi.Vector3f, p.normal, j), d) / length + slack, 0)
+        share = dr.gather(mi.Float, share, lamp)
+        guess = share * here * there / (r2 + spread)
+        total = dr.repeat(dr.block_sum(guess, self.count), self.count)
+        chance = dr.select(total > 0, (1 - BY_POWER) * guess / total, (1 - BY_POWER) * share) + BY_POWER * share
+        self._rows = dr.block_prefix_reduce(dr.ReduceOp.Add, chance, self.count, exclusive=False)
+        self._row = dr.full(mi.UInt32, NONE, len(e))
+        dr.scatter(self._row, dr.arange(mi.UInt32, dr.width(leaves)), leaves)
+        dr.eval(self._rows, self._row)
+
+    def draw(self, lot: "mi.Float", leaf: "mi.UInt32 | None" = None) -> "tuple[mi.UInt32, mi.Float]":
+        """A lamp drawn with ``lot`` in [0, 1) for places on leaves: its patch, and the density of points on it, 1/m²
+        (UInt32, Float [n]). Without leaves, by power."""
+        if leaf is None or self._rows is None:
+            number = self._by_power.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._by_power.whole))
+        else:
+            first = self._first(leaf)
+            last = first + opaque_index(self.count - 1)
+            top = dr.gather(mi.Float, self._rows, last)
+            number = lower_bound_within(self._rows, lot * top, first, last) - first
+        return dr.gather(mi.UInt32, self.lamps, number), self._density(number, leaf)
+
+    def density(
+        self, patch: "mi.UInt32", leaf: "mi.UInt32 | None" = None, active: "mi.Bool | bool" = True
+    ) -> "mi.Float":
+        """Density of the points that `draw` puts on patches, 1/m²; 0 for those that are no lamps (Float [n])."""
+        number = dr.gather(mi.UInt32, self._number, patch, active)
+        is_lamp = active & (number != NONE)
+        return dr.select(is_lamp, self._density(dr.select(is_lamp, number, 0), leaf), 0)
+
+    def _first(self, leaf):
+        """Where the rows of leaves begin; for other elements, which nobody looks at, the first (UInt32 [n])."""
+        row = dr.gather(mi.UInt32, self._row, leaf)
+        return dr.select(row == NONE, 0, row) * opaque_index(self.count)
+
+    def _density(self, number, leaf):
+        if leaf is None or self._rows is None:
+            probability = mi.Float(self._by_power.probability(number))
+        else:
+            first = self._first(leaf)
+            at = first + number
+            before = dr.gather(mi.Float, self._rows, at - 1, number > 0)
+            top = dr.gather(mi.Float, self._rows, first + opaque_index(self.count - 1))
+            probability = (dr.gather(mi.Float, self._rows, at) - dr.select(number > 0, before, 0)) / top
+        return probability / dr.gather(mi.Float, self._patches.area, dr.gather(mi.UInt32, self.lamps, number))
