@@ -2,9 +2,7 @@
 
 import mi_radiosity as mr
 from mi_radiosity.export.relight import irradiance_over
-from mi_radiosity.scene import Light
 from mi_radiosity.scene.lamps import Lamps
-from mi_radiosity.scene.lights import LIGHTS
 
 import drjit as dr
 import mitsuba as mi
@@ -173,44 +171,40 @@ def test_hours(solution):
     assert irradiance_over(solution, []).shape == (0, solution.stats["elements"], 3)
 
 
-class Lantern(Light):
-    """Mitsuba's `point`, into all directions alike."""
-
-    emitters = ("PointLight",)
-
-    def power(self):
-        return [4 * np.pi] * 3
-
-    def shoot(self, x, y, s, t):
-        n = dr.width(x)
-        origin = mi.Point3f(0, 0, 0) + dr.zeros(mi.Float, n)
-        return origin, mi.warp.square_to_uniform_sphere(mi.Point2f(x, y)), mi.Color3f(4 * dr.pi)
-
-    def sample(self, point, s, t):
-        d = -point
-        distance = dr.norm(d)
-        return d / distance, distance, mi.Color3f(1 / (distance * distance))
+def every_kind():
+    """A room with a hole, lit by the sky, a point, and a lamp with a texture of two colours."""
+    texture = np.zeros((2, 2, 3), dtype=np.float32)
+    texture[0], texture[1] = 1.0, (3.0, 0.0, 0.0)
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True, "filter_type": "nearest"}
+    floor, wall = {"bsdf": diffuse(0.5)}, {"bsdf": diffuse(0.5, two_sided=True)}
+    return scene(
+        optimize=False,
+        floor=rectangle(T().scale(2), **floor),
+        wall=rectangle(T().translate([0, 1.5, 1]).rotate([1, 0, 0], 90), **wall),
+        shade=rectangle(above(0.5, 0, 0.2), bsdf=diffuse(0.3), emitter={"type": "area", "radiance": radiance}),
+        lantern={"type": "point", "position": [-1, 0, 0.5], "intensity": {"type": "rgb", "value": 0.3}},
+        sky={"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.4]}},
+    )
 
 
-def test_lamps_that_are_no_surfaces():
-    """They have a layer as any other."""
-    before = dict(LIGHTS)
-    LIGHTS.add("PointLight", Lantern)
-    try:
-        point = {"type": "point", "id": "lantern", "intensity": {"type": "rgb", "value": 1.0}}
-        solution = mr.solve(lit_room(lantern=point), layers=True, **SMALL)
-        assert solution.layers.names == ("one", "two", "lantern")
-        alone = solution.relight({"one": 0, "two": 0, "lantern": 2})
-        assert alone.stats["power"]["emitted"] == pytest.approx(3 * 8 * np.pi, rel=1e-4)
-        assert balance(alone) == pytest.approx(1, rel=1e-3)
-        off = solution.relight({"lantern": 0})
-        assert off.model.lights.free == [] and off.stats["power"]["emitted"] == pytest.approx(3 * 0.36, rel=1e-4)
-        # Straight below, at 1 m: 2 W/sr / 1 m², and what the room reflects.
-        gathered = alone.irradiance([[0, 0, -1]], [[0, 0, 1]])
-        assert gathered[0, 0] > 2
-    finally:
-        LIGHTS.clear()
-        LIGHTS.update(before)
+def test_every_kind_of_lamp():
+    """Sky, points and textures have layers; sums are what the whole is, solved without layers, in the mean."""
+    solution, plain = (mr.solve(every_kind(), layers=layers, **SMALL) for layers in (True, False))
+    assert sorted(solution.layers.names) == ["lantern", "shade", "sky"]
+    assert balance(solution) == pytest.approx(1, rel=1e-3)
+    np.testing.assert_allclose(patch_means(solution), patch_means(plain), rtol=0.02)
+    off = dict.fromkeys(solution.layers.names, 0)
+    assert (np.array(solution.relight(off).radiosity()) == 0).all()
+    shade = solution.relight(off | {"shade": (2, 1, 1)})
+    assert shade.stats["power"]["emitted"] == pytest.approx(0.16 * np.pi * (2 * 2 + 0.5 + 0.5), rel=1e-3)
+    E = np.array(shade.elements.emission(dr.arange(mi.UInt32, len(shade.elements))))
+    assert E[0].max() == pytest.approx(6 * np.pi, rel=1e-3) and E[2].max() == pytest.approx(np.pi, rel=1e-3)
+    # Straight below the lantern, at 0.5 m: 2 · 0.3 / 0.25, gathered there.
+    lantern = solution.relight(off | {"lantern": 2})
+    assert lantern.irradiance([[-1, 0, 0]], [[0, 0, 1]])[0, 0] == pytest.approx(2.4, rel=0.1)
+    assert [type(light).__name__ for light in lantern.model.lights.free] == ["Dimmed"]
+    blue = solution.relight(off | {"sky": (0, 0, 1)})
+    assert (np.array(blue.radiosity())[:2] == 0).all() and np.array(blue.radiosity())[2].max() > 0
 
 
 @pytest.mark.parametrize(
