@@ -21,8 +21,9 @@ if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
 
     from .evaluation.scenes import SceneFile
-    from .scene import Model
+    from .scene.report import Report as SceneReport
     from .solver import Solution
+    from .solver.cost import Cost
 
 PROGRAM = "mi-radiosity"
 STAGES = {
@@ -123,7 +124,8 @@ def _render_arguments(parser):
     _solve_arguments(parser.add_argument_group("solution"))
     add("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
     add("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
-    _shading_argument(parser)
+    _shading_argument(parser, "gather")
+    add("--denoise", action="store_true", help="remove the noise of the samples (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
     add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
     add("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")
@@ -212,9 +214,11 @@ def _definition(text):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import SHADERS, Shader, write_image
+    from .display import SHADERS, Shader, require_denoiser, write_image
 
     options = _solve_options(arguments)
+    if arguments.denoise:
+        require_denoiser()
     for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
         check_writable(path)
     scene = arguments.file.load()
@@ -224,7 +228,7 @@ def _render(arguments: argparse.Namespace) -> None:
         _keep(arguments, solution)
         for number, view in enumerate(views):
             report("render", number, len(views))
-            image = solution.render(view, spp=arguments.spp, shading=arguments.shading)
+            image = solution.render(view, arguments.spp, arguments.shading, denoise=arguments.denoise)
             write_image(view_name(arguments.output, view, views), image, solution.stats)
             report("render", number + 1, len(views))
     shader: type[Shader] = SHADERS.find(arguments.shading)
@@ -364,42 +368,50 @@ def _info(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from .scene import Model, inspect
+    from .scene.report import report
+    from .solver.cost import estimate_cost
 
     scene = arguments.file.load()
     console = Console()
-    title: dict[str, Any] = {"title": str(arguments.scene), "title_justify": "left"}
-    if findings := inspect(scene):
-        table = Table("not modelled", "why", **title)
-        for finding in findings:
-            table.add_row(finding.what, finding.why)
-    else:
-        table = Table(**title, show_header=False)
-        for name, value in _facts(Model(scene)):
-            table.add_row(name, value)
-    console.print(table)
+    found = report(scene)
+    shapes = Table("shape", "class", "faces", "fronts", "backs", "BSDF", "it is", title=str(arguments.scene))
+    for row in found.shapes:
+        counts = ("?" if n is None else f"{n:,}" for n in (row.faces, row.fronts, row.backs))
+        shapes.add_row(row.name, row.kind, *counts, row.bsdf, row.treatment)
+    lamps = Table("lamp", "class", "power, W", "it is")
+    for lamp in found.lamps:
+        power = "?" if lamp.power is None else ", ".join(f"{p:.4g}" for p in lamp.power)
+        lamps.add_row(lamp.name, lamp.kind, power, lamp.treatment)
+    facts = Table(show_header=False)
+    for name, value in [*_facts(scene, found), *_costs(estimate_cost(found.model) if found.model else None)]:
+        facts.add_row(name, value)
+    for table in (shapes, lamps, facts):
+        console.print(table)
 
 
-def _facts(model: "Model") -> Iterator[tuple[str, str]]:
+def _facts(scene: "mi.Scene", found: "SceneReport") -> Iterator[tuple[str, str]]:
     """What there is to know of a scene before it is solved."""
-    import drjit as dr
-    import numpy as np
+    yield "sensors", f"{len(scene.sensors())}"
+    for refused in found.refused or ["nothing: the whole scene is modelled"]:
+        yield "refused", refused
+    if model := found.model:
+        fronts = int((model.patches.sides % 2 == 0).sum())
+        backs = model.patches.count - fronts
+        yield "faces", f"{len(model.faces.shape):,}"
+        yield "patches", f"{model.patches.count:,} ({fronts:,} fronts, {backs:,} backs)"
+        yield "sides no light reaches", f"{model.unreached:,}, left out"
+        yield "area of patches", f"{model.patches.total_area:.6g}"
+        for warning in model.warnings:
+            yield "warning", warning
 
-    patches = model.patches
-    fronts = int((patches.sides % 2 == 0).sum())
-    power = [dr.sum(e * patches.area)[0] for e in patches.emission]
-    lamps = np.count_nonzero(np.array(dr.max(patches.emission)))
-    yield "shapes", f"{len(model.scene.shapes()):,}"
-    yield "faces", f"{len(model.faces.shape):,}"
-    yield "patches", f"{patches.count:,} ({fronts:,} fronts, {patches.count - fronts:,} backs)"
-    yield "sides no light reaches", f"{model.unreached:,}, left out"
-    yield "area of patches", f"{patches.total_area:.6g}"
-    yield "lamps", f"{lamps:,} patches, {power[0]:.4g}, {power[1]:.4g}, {power[2]:.4g} W"
-    yield "textured reflectance", "yes" if model.materials.textured else "no"
-    yield "sensors", f"{len(model.scene.sensors())}"
-    yield "not modelled", "nothing: the whole scene is"
-    for warning in model.warnings:
-        yield "warning", warning
+
+def _costs(cost: "Cost | None") -> Iterator[tuple[str, str]]:
+    """What a solve by default costs."""
+    if cost:
+        yield "elements by default", f"{cost.elements:,}"
+        yield "rays by default", f"{cost.rays:,}"
+        yield "memory, about", f"{cost.memory / 2**20:,.0f} MiB"
+        yield "time here, about", f"{cost.seconds:.0f} s" if cost.seconds > 1 else "a second"
 
 
 # ---- What commands share ---------------------------------------------------------------------------

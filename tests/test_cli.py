@@ -50,20 +50,38 @@ def test_all_views(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["office_0.png", "office_1.png"]
 
 
-def test_info(capsys, tmp_path):
+def test_info(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
     assert main(["info", BOX]) == 0
-    assert "12 fronts" in capsys.readouterr().out
-    bad = tmp_path / "ball.xml"
-    bad.write_text('<scene version="3.0.0"><shape type="sphere" id="ball"/></scene>')
-    assert main(["info", str(bad)]) == 0
-    assert "ball" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    for says in ("12 fronts", "diffuse", "leaves from patches", "elements by default", "memory"):
+        assert says in out
 
 
-def test_definitions(tmp_path):
+@pytest.mark.parametrize(
+    "parts, says",
+    [
+        ('<shape type="sphere" id="ball"><medium type="homogeneous" name="interior"/></shape>', "remove the medium"),
+        ('<shape type="sphere" id="ball"/>', "no light"),
+        ("", "no shapes"),
+    ],
+    ids=["medium", "dark", "empty"],
+)
+def test_info_of_scenes_that_cannot_be_solved(capsys, monkeypatch, tmp_path, parts, says):
+    monkeypatch.setenv("COLUMNS", "160")
+    (tmp_path / "bad.xml").write_text(f'<scene version="3.0.0">{parts}</scene>')
+    assert main(["info", str(tmp_path / "bad.xml")]) == 0
+    out = capsys.readouterr().out
+    assert says in out and ("ball" in out or not parts)
+
+
+def test_definitions(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("COLUMNS", "160")
     file = tmp_path / "box.xml"
     file.write_text(open(BOX).read().replace('value="0.5"/></bsdf>', 'value="$rho"/></bsdf>'))
-    assert main(["info", str(file), "-D", "rho=0.2"]) == 0
-    assert main(["info", str(file), "-D", "rho=1.5"]) == 2
+    for rho, says in (("0.2", "nothing: the whole"), ("1.5", "less than 1")):
+        assert main(["info", str(file), "-D", f"rho={rho}"]) == 0
+        assert says in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_power_arrives_where_lines_to_the_lamp_say(name):
     up = mi.Vector3f(0, 0, 1)
     sampled = light.lights_up(model.rays, point, up, s, t)
     assert shot == pytest.approx(np.array([dr.mean(h)[0] for h in sampled]), rel=0.01)
-    if model.lights.has_sky:
+    if model.lights.sky_light:
         a, b, s, t = kronecker(dr.arange(mi.UInt32, n), zero + 2, zero)
         outwards = mi.warp.square_to_cosine_hemisphere(mi.Point2f(a, b))
         seen = ~model.scene.ray_test(mi.Ray3f(mi.Point3f(1.5 * (2 * s - 1), 2 * t - 1, 1e-4), outwards))

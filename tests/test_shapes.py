@@ -2,6 +2,8 @@
 
 import mi_radiosity as mr
 from mi_radiosity.scene import Model, inspect
+from mi_radiosity.scene.report import report
+from mi_radiosity.solver.cost import estimate_cost
 
 import drjit as dr
 import mitsuba as mi
@@ -169,3 +171,24 @@ def test_inspect_lists_everything(tmp_path):
     shapes = {kind: {"type": kind, **odd_shape(kind, tmp_path)} for kind in ("linearcurve", "sdfgrid")}
     found = [finding.what for finding in inspect(above(**shapes))]
     assert found == ["shape 'linearcurve' (LinearCurve)", "shape 'sdfgrid' (SDFGrid)"]
+
+
+def test_a_report_says_what_everything_is(tmp_path):
+    odd = {"type": "sdfgrid", "id": "odd", **odd_shape("sdfgrid", tmp_path)}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.5}}
+    glass = {"type": "sphere", "center": [0, 0, 1.2], "radius": 0.2, "bsdf": {"type": "plastic"}}
+    fair = above(**group(**members()), it=instance(PLACES[0]), glass=glass, sky=sky)
+    found = report(fair)
+    rows = {row.name: row for row in found.shapes}
+    ball, cube = rows["shape 'ball' of instance 'it'"], rows["shape 'cube' of instance 'it'"]
+    assert ball.kind == "Sphere" and ball.fronts == ball.faces and cube.faces == 12 and cube.backs == 0
+    assert rows["shape 'glass'"].treatment == "diffuse lobe, others traced" and cube.treatment == "diffuse"
+    assert sum(row.fronts + row.backs for row in found.shapes) == found.model.patches.count
+    lamps = {lamp.kind: lamp for lamp in found.lamps}
+    assert (
+        lamps["AreaLight"].power == pytest.approx([2 * 0.96] * 3) and min(lamps["ConstantBackgroundEmitter"].power) > 0
+    )
+    cost, solution = estimate_cost(found.model), mr.solve(found.model, rays=10_000)
+    assert cost.elements == pytest.approx(solution.stats["elements"], abs=3) and cost.seconds > 0 < cost.memory
+    refused = report(above(odd=odd, sky=sky))
+    assert refused.model is None and "odd" in refused.refused[0] and "mesh" in refused.shapes[-1].treatment

@@ -1,6 +1,7 @@
 """Radiosity shown: shadings by name, and the `radiosity` integrator."""
 
 from ..solver import Field
+from .denoise import require_denoiser
 from .image import write_image
 from .integrator import register, render
 from .lux import Lux, lux_scale
@@ -17,5 +18,6 @@ __all__ = [
     "lux_scale",
     "register",
     "render",
+    "require_denoiser",
     "write_image",
 ]

@@ -11,6 +11,7 @@ from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import Solution, solve
+from .denoise import denoised_picture
 from .pixels import picture
 from .shaders import SHADERS, Look
 
@@ -66,13 +67,16 @@ def _integrator_class():
             self._display(solve(scene, **self.options, progress=self.progress), given=False)
             return self.solution
 
-        def picture(self, scene, sensor, seed, spp):
-            """What `mi.render` gives, of a sensor or its number."""
+        def picture(self, scene, sensor, seed, spp, denoise=False):
+            """What `mi.render` gives, of a sensor or its number; denoised if asked for."""
             if isinstance(sensor, int):
                 count = len(scene.sensors())
                 if not 0 <= sensor < count:
                     raise RadiosityError(f"there is no sensor {sensor}: the scene has {count}, counted from 0")
                 sensor = scene.sensors()[sensor]
+            if denoise:
+                self.prepare(scene)
+                return denoised_picture(scene, sensor, spp, seed, self.sample)
             return self.render(scene, sensor, seed=seed, spp=spp)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -101,10 +105,10 @@ def _integrator_class():
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
             reflectance = _reflectance(model, prelim, ray, hit, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
-            emission = model.lights.seen(model.patches, hit, emits)
+            emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, emits)
             look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
-            if model.lights.has_sky and not self.hide_emitters:
+            if model.lights.sky_light and not self.hide_emitters:
                 direction = ray.d if rays.lobes is None else hit.direction
                 radiance += model.lights.sky(direction, active & ~hit.valid) * dr.inv_pi
                 valid |= active

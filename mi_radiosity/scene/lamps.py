@@ -55,9 +55,8 @@ class Lamps:
         model, rays = copy.copy(self.model), copy.copy(self.model.rays)
         emission = owned_vectors(mi.Color3f, self._emission * factor[self._of_patch])
         model.patches = rays.patches = replace(self.model.patches, emission=emission)
-        sky = next((scale for light, scale in free if light.emitter.is_environment()), np.ones(3))
         dimmed: list[Light] = [Dimmed(light, scale) for light, scale in free if scale.any()]
-        model.lights, model.rays = self.model.lights.dimmed(factor[self._number[:-1]], dimmed, sky), rays
+        model.lights, model.rays = self.model.lights.dimmed(factor[self._number[:-1]], dimmed), rays
         return model
 
     def exitance(self, exitance: "mi.Color3f | None", patch: "mi.UInt32", scales: np.ndarray) -> "mi.Color3f | None":
@@ -80,7 +79,7 @@ class Dimmed(Light):
     def __init__(self, light: Light, scale: np.ndarray):
         super().__init__(light.emitter, light.scene, light.low, light.high)
         self._light, self._scale = light, [float(x) for x in scale]
-        self._color = mi.Color3f(*(dr.opaque(mi.Float, x) for x in self._scale))
+        self.color = mi.Color3f(*(dr.opaque(mi.Float, x) for x in self._scale))
 
     def power(self) -> Sequence[float]:
         return [float(p) * s for p, s in zip(self._light.power(), self._scale)]
@@ -89,14 +88,17 @@ class Dimmed(Light):
         self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
     ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
         origin, direction, power = self._light.shoot(x, y, s, t)
-        return origin, direction, power * self._color
+        return origin, direction, power * self.color
 
     def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
         direction, distance, irradiance = self._light.sample(point, s, t)
-        return direction, distance, irradiance * self._color
+        return direction, distance, irradiance * self.color
 
-    def lights_up(self, rays: Any, *places: Any) -> "mi.Color3f":
-        return self._light.lights_up(rays, *places) * self._color
+    def density(self, direction: "mi.Vector3f") -> "mi.Float":
+        return self._light.density(direction)
+
+    def lights_up(self, rays: Any, *places: Any, **options: Any) -> "mi.Color3f":
+        return self._light.lights_up(rays, *places, **options) * self.color
 
     def fingerprint(self) -> bytes:
         return self._light.fingerprint()

@@ -30,6 +30,7 @@ class Light:
 
     emitters: tuple[str, ...] = ()
     on_surface = False
+    color: Any = 1.0  # what rays see of it that leave the scene is multiplied by
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -72,6 +73,18 @@ class Light:
             parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
         return b"".join(parts)
 
+    def density(self, direction: "mi.Vector3f") -> "mi.Float":
+        """Density of `sample` over directions, 1/sr, if rays that leave the scene see the lamp; else 0 (Float [n])."""
+        return mi.Float(0)
+
+    def share_of_rays(self, direction: "mi.Vector3f", cosine: "mi.Float", rays_per_line: "float | None") -> "mi.Float":
+        """The balance heuristic's weight of cosine-distributed rays that see the lamp, of which there are so many per
+        `sample` (None: there are no samples) (Float [n])."""
+        if rays_per_line is None:
+            return mi.Float(1)
+        density, of_rays = self.density(direction), rays_per_line * dr.maximum(cosine, 0) * dr.inv_pi
+        return dr.select(density > 0, of_rays / (density + of_rays), 0)
+
     def lights_up(
         self,
         rays: Any,
@@ -80,14 +93,17 @@ class Light:
         s: "mi.Float",
         t: "mi.Float",
         active: "mi.Bool | bool" = True,
+        rays_per_line: float = 0.0,
     ) -> "mi.Color3f":
-        """H at points x, relative to the patches' origin, with their normals: one `sample` each (Color3f [n])."""
+        """H at points x, relative to the patches' origin, with their normals: one `sample` each, weighed against the
+        rays that see the lamp (Color3f [n])."""
         direction, distance, irradiance = self.sample(x + rays.patches.origin, s, t)
         cosine = dr.dot(direction, normal)
         lit = active & (cosine > 0) & (dr.max(irradiance) > 0)
         start = x + normal * rays.patches.lift
         hidden = rays.blocked(start, start + direction * distance, lit)
-        return dr.select(lit & ~hidden, irradiance * cosine, 0)
+        share = 1 - self.share_of_rays(direction, cosine, rays_per_line)
+        return dr.select(lit & ~hidden, irradiance * cosine * share, 0)
 
 
 class Area(Light):
@@ -156,6 +172,13 @@ class Infinite(Free):
         "TimedSunskyEmitter",
     )
 
+    def density(self, direction: "mi.Vector3f") -> "mi.Float":
+        if not self.emitter.is_environment():
+            return mi.Float(0)
+        sample = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+        sample.d = direction
+        return self.emitter.pdf_direction(dr.zeros(mi.Interaction3f), sample)
+
     def shoot(
         self, x: "mi.Float", y: "mi.Float", s: "mi.Float", t: "mi.Float"
     ) -> "tuple[mi.Point3f, mi.Vector3f, mi.Color3f]":
@@ -212,9 +235,8 @@ class Lights:
     """
 
     def __init__(self, faces: Faces, required: bool = True) -> None:
-        self._faces, self._environment, self.required = faces, faces.scene.environment(), required
+        self._faces, self.required = faces, required
         self._dim: Any = None
-        self._sky_dim: Any = None
         emitters = [part.shape.emitter() for part in faces.parts]
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
         self._kinds = list(dict.fromkeys(kind for kind in kinds if kind and kind.on_surface))
@@ -251,13 +273,12 @@ class Lights:
         lights = [kind(emitter, scene, *box) for emitter, kind in kinds if not kind.on_surface]
         return sorted(lights, key=lambda light: light.fingerprint())
 
-    def dimmed(self, shapes: np.ndarray, free: "list[Light]", sky: np.ndarray) -> "Lights":
-        """The same lamps: exitance times ``shapes`` [shapes of faces.tracing, 3], ``free`` in the place of those that
-        are no surfaces, and what rays see that leave the scene times ``sky`` [3]."""
+    def dimmed(self, shapes: np.ndarray, free: "list[Light]") -> "Lights":
+        """The same lamps, exitance times ``shapes`` [shapes of faces.tracing, 3], and ``free`` in the place of those
+        that are no surfaces."""
         other = copy.copy(self)
         other.exitance, other.free = self.exitance * shapes[self._faces.shape], free
         other._dim = owned_vectors(mi.Color3f, shapes)
-        other._sky_dim = mi.Color3f(*(dr.opaque(mi.Float, c) for c in sky))
         return other
 
     # ---- Light at points and in directions -----------------------------------------------------
@@ -286,27 +307,29 @@ class Lights:
         values = self.exitance_at(face, u0 + scale * a, v0 + scale * b)
         return mi.Color3f(*(dr.block_sum(x + dr.zeros(mi.Float, dr.width(k)), points) / mi.Float(each) for x in values))
 
-    def seen(self, patches: Any, hit: Any, active: "mi.Bool | bool" = True) -> "mi.Color3f":
-        """E where rays meet patches, as it is at that point (Color3f [n])."""
-        mean = dr.gather(mi.Color3f, patches.emission, hit.patch, active)
+    def at(
+        self, patches: Any, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.Color3f":
+        """E at points of patches (Color3f [n])."""
+        mean = dr.gather(mi.Color3f, patches.emission, patch, active)
         if not self.textured:
             return mean
         shines = active & (dr.max(mean) > 0)
-        return self.exitance_at(dr.gather(mi.UInt32, patches.face, hit.patch, shines), hit.u, hit.v, shines)
+        return self.exitance_at(dr.gather(mi.UInt32, patches.face, patch, shines), u, v, shines)
 
     def sky(self, direction: "mi.Vector3f", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         """E = π L of what rays see that leave the scene in a direction (Vector3f ─► Color3f [n])."""
-        if self._environment is None:
+        if self.sky_light is None:
             return mi.Color3f(0)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        sky = dr.pi * dr.select(active, mi.Color3f(self._environment.eval(si, active)), 0)
-        return sky if self._dim is None else sky * self._sky_dim
+        seen = dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
+        return dr.pi * seen * self.sky_light.color
 
     @property
-    def has_sky(self) -> bool:
-        """Do rays that leave the scene see anything?"""
-        return self._environment is not None
+    def sky_light(self) -> Light | None:
+        """The lamp that rays see which leave the scene, or None."""
+        return next((light for light in self.free if light.emitter.is_environment()), None)
 
 
 def varies(emitter: "mi.Emitter") -> bool:

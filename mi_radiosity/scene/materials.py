@@ -1,5 +1,6 @@
 """Reflectances of the faces, and what of a Mitsuba scene is modelled at all."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import drjit as dr
@@ -11,7 +12,7 @@ from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .faces import Faces
 from .lights import LIGHTS
-from .tessellate import UNMESHED, children, parts
+from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
@@ -140,7 +141,7 @@ def is_textured(bsdf: "mi.BSDF") -> bool:
 
 
 def _inspect_shape(shape):
-    """What is wrong with a shape."""
+    """What is wrong with a shape that is no mesh."""
     if shape.class_name() == "Instance":
         yield "its shape group is not found: give the group an id, in the scene itself, and refer to it"
     elif shape.class_name() in UNMESHED:
@@ -149,7 +150,8 @@ def _inspect_shape(shape):
         yield "shapes of this kind are not modelled: export it as a mesh"
 
 
-def _inspect_part(part):
+def inspect_part(part: Part) -> Iterator[str]:
+    """What is wrong with a part of a scene."""
     shape = part.shape
     if not part.can_mesh:
         yield from _inspect_shape(shape)
@@ -160,7 +162,8 @@ def _inspect_part(part):
         yield "its emitter is in a medium, and those are not modelled: remove the medium"
 
 
-def _inspect_emitter(emitter):
+def inspect_emitter(emitter: "mi.Emitter") -> Iterator[str]:
+    """What is wrong with an emitter."""
     if emitter.class_name() not in LIGHTS:
         yield f"emitters of this kind are not modelled: use one of {', '.join(LIGHTS)}"
     elif refusal := LIGHTS.find(emitter.class_name()).refusal(emitter):
@@ -171,10 +174,10 @@ def inspect(scene: "mi.Scene") -> list[Finding]:
     """List everything in ``scene`` that the solver does not model."""
     findings = []
     for part in parts(scene):
-        findings += [Finding(f"{part.name} ({part.shape.class_name()})", why) for why in _inspect_part(part)]
+        findings += [Finding(f"{part.name} ({part.shape.class_name()})", why) for why in inspect_part(part)]
     for index, emitter in enumerate(scene.emitters()):
         what = f"emitter '{emitter.id() or index}' ({emitter.class_name()})"
-        findings += [Finding(what, why) for why in _inspect_emitter(emitter)]
+        findings += [Finding(what, why) for why in inspect_emitter(emitter)]
     return findings
 
 

@@ -34,7 +34,7 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
         links.append((source, target))
         if emits.any():
             links.append(_towards_lamps(rays, np.flatnonzero(emits), source, number))
-        if lights.has_sky:
+        if lights.sky_light:
             lit[source[escaped]] = True
         lit[_see_free(rays, lights, source, number)] = True
         a, b = (np.concatenate(ends) for ends in zip(*links))

@@ -78,7 +78,7 @@ class Field:
         a, b = child_point(quarter, a, b)
         walled = active & dr.gather(mi.Bool, self._walled, leaf, active)
         x = e.patches.above(dr.gather(mi.UInt32, e.patch, leaf, active), u, v)
-        total, seen, weights = mi.Color3f(0), mi.Color3f(0), mi.Float(0)
+        total, seen, weights, unknown = mi.Color3f(0), mi.Color3f(0), mi.Float(0), mi.Float(0)
         for corner, weight in enumerate((1 - a - b, a, b)):
             node = 6 * leaf + child_corner(quarter, corner)
             value = dr.gather(mi.Color3f, self.nodes, node, active)
@@ -86,13 +86,14 @@ class Field:
             value = dr.select(known, value, 0)
             hidden = ~known | self._rays.blocked(x, dr.gather(mi.Point3f, self._points, node, walled), walled & known)
             total, seen = total + value * weight, seen + dr.select(hidden, 0, value * weight)
-            weights += dr.select(hidden, 0, weight)
+            weights, unknown = weights + dr.select(hidden, 0, weight), unknown + dr.select(known, 0, weight)
         alone = walled & (weights <= FAINT)
-        total = dr.select(alone, self._without_nodes(leaf, x, total, alone), total)
+        lost = alone & (unknown > FAINT)
+        total = dr.select(lost, self._without_nodes(leaf, x, total, lost), total)
         return dr.select(walled & ~alone, seen / weights, total)
 
     def _without_nodes(self, leaf, x, total, active):
-        """H at points x of walled leaves that see no node: the leaf's own if light came down in sight, nothing if it
+        """H at points x of walled leaves that see no node, and know nothing of some: the leaf's own if light came down in sight, nothing if it
         came down elsewhere, and ``total`` where that is not known (Color3f [n])."""
         if self._solution.landings.slots == 0:
             return total

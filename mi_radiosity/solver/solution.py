@@ -175,16 +175,23 @@ class Solution:
         )
 
     def render(
-        self, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
+        self,
+        sensor: "mi.Sensor | int" = 0,
+        spp: int = 16,
+        shading: str = "gouraud",
+        seed: int = 0,
+        denoise: bool = False,
     ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
+        shading: ``gather`` and ``direct`` gather light at every pixel, ``gouraud`` and ``flat`` show what was solved.
+        denoise: remove the noise of the samples by Open Image Denoise (extra ``denoise``); the picture has 3 channels.
         Raises RadiosityError if the scene has been edited since it was solved.
         """
         self.require_unchanged()
         integrator = mi.load_dict({"type": "radiosity"})
         integrator.show(self, shading)
-        return integrator.picture(self.model.scene, sensor, seed, spp)
+        return integrator.picture(self.model.scene, sensor, seed, spp, denoise)
 
     def relight(self, scales: Scales) -> "Solution":
         """The solution with lamps dimmed or recoloured, exact by superposition, and without a ray.

@@ -58,7 +58,7 @@ def solve(
     report, clock = progress or (lambda stage, done, total: None), _Clock()
 
     model = scene if isinstance(scene, Model) else Model(scene)
-    wanted = _wanted(model, elements, epsilon)
+    wanted = wanted_elements(model, elements, epsilon)
     clock.lap("scene")
 
     tree = Tree(model.patches, model.materials, model.lights)
@@ -79,7 +79,7 @@ def solve(
     problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
     clock.lap("refine")
 
-    rays = int(rays or RAYS_PER_ELEMENT * min(tree.leaf_count, ELEMENTS) + LEAST_RAYS * tree.leaf_count)
+    rays = int(rays or default_rays(tree.leaf_count))
     shot = 0
 
     def carry(problem, rays_here, number=0, before=0):
@@ -141,7 +141,12 @@ def _check(oracle, elements, epsilon, rays, lines):
         raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
 
 
-def _wanted(model, elements, epsilon):
+def default_rays(elements: int) -> int:
+    """The ray budget of so many leaf elements where none is given."""
+    return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
+
+
+def wanted_elements(model: Model, elements: int | None, epsilon: float | None) -> int | None:
     """Leaves to refine to, or None where ε decides."""
     count = model.patches.count
     if epsilon is not None:

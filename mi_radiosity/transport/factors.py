@@ -17,7 +17,7 @@ from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
 from ..mesh import Elements, Tree
 from ..scene import Model
 from .contour import exchange_area
-from .facets import AT_ONCE, OUTSIDE, Facets, count_rays
+from .facets import AT_ONCE, OUTSIDE, Counts, Facets, count_rays
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
 FEW = 8  # rays between two cells that lines are worth
@@ -124,7 +124,7 @@ def view_factors(
 class _Exchange:
     """Exchange areas A_i F_ij: a symmetric SciPy CSR ``area`` [cells, cells], and the ``variance`` of its data."""
 
-    def __init__(self, facets, counts, seed, progress) -> None:
+    def __init__(self, facets: Facets, counts: Counts, seed: int, progress: Callable[[int, int], None]) -> None:
         self.facets, self.progress = facets, progress
         self.seed = opaque_index(stream_seed(seed, Stream.FACTORS, 1))
         self.density = counts.cast / facets.area  # rays per m²

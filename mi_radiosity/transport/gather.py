@@ -60,9 +60,9 @@ class Gatherer:
             u, v = triangle(s, t)
             F = rays.kernel_at(x, normal, lamp, u, v, active)
             shared = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
-            total += self._emission(lamp, u, v, F > 0) * (F / (density + shared))
+            total += self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * (F / (density + shared))
         for light in self._free:
-            total += light.lights_up(rays, x, normal, s, t, active)
+            total += light.lights_up(rays, x, normal, s, t, active, rays_per_line)
         return total
 
     def rays(
@@ -84,21 +84,24 @@ class Gatherer:
         hit = model.rays.follow(origin, direction, number, seed, active=active)
         met = active & (hit.patch != NONE)
         H = self._looked_up(hit, met)
-        emission = model.lights.seen(patches, hit, met)
+        emission = model.lights.at(patches, hit.patch, hit.u, hit.v, met)
         if model.rays.lobes is None:
-            return H, emission * self._share_of_rays(places, hit, met, rays_per_line)
+            sky = self._sky(places, direction, active & ~hit.valid, rays_per_line)
+            return H, emission * self._share_of_rays(places, hit, met, rays_per_line) + sky
         straight = met & ~hit.bounced
         lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
+        lamp += self._sky(places, direction, active & ~hit.valid & ~hit.bounced, rays_per_line)
         seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
-        sky = model.lights.sky(hit.direction, active & hit.bounced & ~hit.valid)
-        return dr.select(active, hit.glow + hit.weight * (H + seen + sky), 0), lamp
+        seen += model.lights.sky(hit.direction, active & ~hit.valid & hit.bounced)
+        return dr.select(active, hit.glow + hit.weight * (H + seen), 0), lamp
 
-    def _emission(self, patch, u, v, active):
-        """E at points of lamps (Color3f [n])."""
-        lights, patches = self._model.lights, self._model.patches
-        if not lights.textured:
-            return dr.gather(mi.Color3f, patches.emission, patch)
-        return lights.exitance_at(dr.gather(mi.UInt32, patches.face, patch), u, v, active)
+    def _sky(self, places, direction, escaped, rays_per_line):
+        """H from the sky that rays meet which go straight there, as far as lines do not find it (Color3f [n])."""
+        lights = self._model.lights
+        if lights.sky_light is None:
+            return mi.Color3f(0)
+        share = lights.sky_light.share_of_rays(direction, dr.dot(places.normal, direction), rays_per_line)
+        return lights.sky(direction, escaped) * share
 
     def _looked_up(self, hit, met):
         """ρ H where rays end, 0 behind walls that keep the light of their leaf from them (Color3f [n])."""

@@ -52,7 +52,7 @@ class Shooting(Transport):
     Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
     """
 
-    tail: float = 0.01
+    tail: float = 0.0001  # little of the sun comes into a room, and is not to end with what stays outside
     numbering: Callable = numbered_through
     deposit: Callable = trusted
     records: bool = False

@@ -1,0 +1,65 @@
+"""Pictures of few samples without their noise, by Open Image Denoise."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.errors import RadiosityError
+from .pixels import AT_ONCE, PixelPoints
+
+
+def require_denoiser() -> None:
+    """Raise RadiosityError if the library is missing."""
+    try:
+        import mitsuba_oidn  # noqa: F401
+    except ImportError:
+        raise RadiosityError("denoising needs mitsuba-oidn: pip install 'mi_radiosity[denoise]'") from None
+
+
+def denoised_picture(scene, sensor, spp, seed, sample) -> "mi.TensorXf":
+    """A picture [height, width, 3] of ``spp`` samples per pixel of ``sample(scene, sampler, ray)``, denoised.
+
+    Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals
+    of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel.
+    """
+    import mitsuba_oidn
+
+    require_denoiser()
+    width, height = (int(n) for n in sensor.film().crop_size())
+    if sensor.film().sample_border():
+        raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
+    sums, first = np.zeros((3, height * width, 3)), 0
+    while first < spp:
+        count = min(max(1, AT_ONCE // (width * height)), spp - first)
+        sums += _sums(scene, sensor, PixelPoints(width * height, first, count, spp, seed), count, sample)
+        first += count
+    color, albedo, normal = (np.ascontiguousarray(s.reshape(height, width, 3) / spp, np.float32) for s in sums)
+    clean = mitsuba_oidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True, clean_aux=True)
+    return mi.TensorXf(_filtered(np.asarray(clean), sensor.film().rfilter()))
+
+
+def _sums(scene, sensor, points, count, sample):
+    """Sums over samples of radiance, albedo and normal [3, pixels, 3]."""
+    from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
+
+    ray, weight, _ = ADIntegrator.sample_rays(None, scene, sensor, points)
+    radiance, _, _ = sample(scene, points, ray)
+    si = scene.ray_intersect(ray)
+    valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
+    albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
+    albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
+    planes = mi.Color3f(radiance * weight), mi.Color3f(albedo), dr.select(valid, normal, 0)
+    return np.array([[dr.block_sum(c, count) for c in plane] for plane in planes], dtype=np.float64).swapaxes(1, 2)
+
+
+def _filtered(image, rfilter):
+    """An image of box-filtered pixels under a reconstruction filter, along rows and columns."""
+    reach = int(np.ceil(rfilter.radius() - 0.5))
+    if rfilter.is_box_filter() or reach < 1:
+        return image
+    weight = np.array([float(rfilter.eval(float(k))[0]) for k in range(-reach, reach + 1)])
+    for axis in (0, 1):
+        pad = [(reach, reach) if a == axis else (0, 0) for a in range(3)]
+        padded, n = np.pad(image, pad, mode="edge"), image.shape[axis]
+        image = sum(w * np.take(padded, range(k, k + n), axis=axis) for k, w in enumerate(weight / weight.sum()))
+    return image.astype(np.float32)

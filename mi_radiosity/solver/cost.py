@@ -1,0 +1,54 @@
+"""What a solve will cost, before it is begun."""
+
+import time
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import opaque_index
+from ..core.points import kronecker, triangle
+from ..scene import Model
+from ..transport.emit import AT_ONCE
+from .solve import default_rays, wanted_elements
+
+PROBES = 1 << 19  # rays that are timed
+# Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
+PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY = 110e6, 2.5e3, 4e3, 24
+# Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
+WORK, LINES = 2, 640
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read."""
+
+    elements: int
+    rays: int
+    memory: float
+    seconds: float
+
+
+def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
+    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two.
+
+    Time is a multiple of what some rays take that are traced here and now.
+    """
+    count = wanted_elements(model, elements, None) or model.patches.count
+    rays = rays or default_rays(count)
+    _trace(model)  # once before, as kernels are compiled
+    start = time.perf_counter()
+    _trace(model)
+    ray, more = (time.perf_counter() - start) / PROBES, count - model.patches.count
+    memory = PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE)
+    return Cost(count, rays, memory, ray * (WORK * rays + LINES * more))
+
+
+def _trace(model):
+    """Trace cosine-distributed rays from all over the scene."""
+    n = dr.arange(mi.UInt32, PROBES)
+    u, v, s, t = kronecker(n, opaque_index(0), opaque_index(0))
+    patch = n % opaque_index(model.patches.count)
+    hit = model.rays.follow(*model.rays.leave(patch, *triangle(u, v), s, t), n, opaque_index(0))
+    dr.eval(hit.patch, hit.u)
+    dr.sync_thread()
