@@ -147,9 +147,9 @@ def _solve_arguments(group):
     add("--seed", type=int, metavar="K", help="random seed (default 0)")
 
 
-def _shading_argument(parser):
-    names = "gouraud, flat, mesh, lux or a plugin's (default gouraud)"
-    parser.add_argument("--shading", default="gouraud", metavar="NAME", help=names)
+def _shading_argument(parser, default="gouraud"):
+    names = f"gouraud, flat, mesh, gather, lux or a plugin's (default {default})"
+    parser.add_argument("--shading", default=default, metavar="NAME", help=names)
 
 
 def _reference_arguments(parser):
