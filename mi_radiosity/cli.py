@@ -148,7 +148,7 @@ def _solve_arguments(group):
 
 
 def _shading_argument(parser, default="gouraud"):
-    names = f"gouraud, flat, mesh, gather, lux or a plugin's (default {default})"
+    names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"
     parser.add_argument("--shading", default=default, metavar="NAME", help=names)
 
 

@@ -1,5 +1,7 @@
 """Pictures of few samples without their noise, by Open Image Denoise."""
 
+from collections.abc import Callable
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,7 +18,7 @@ def require_denoiser() -> None:
         raise RadiosityError("denoising needs mitsuba-oidn: pip install 'mi_radiosity[denoise]'") from None
 
 
-def denoised_picture(scene, sensor, spp, seed, sample) -> "mi.TensorXf":
+def denoised_picture(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable) -> "mi.TensorXf":
     """A picture [height, width, 3] of ``spp`` samples per pixel of ``sample(scene, sampler, ray)``, denoised.
 
     Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals

@@ -172,7 +172,8 @@ def _seed(seed: int, number: int) -> int:
 
 def path_image(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int = 0) -> np.ndarray:
     """Picture by Mitsuba's `path`, unlimited depth, independent of any reference (float32 [height, width, 3])."""
-    image, done, tracer = 0.0, 0, _path()
+    image: Any = 0.0
+    done, tracer = 0, _path()
     while done < spp:
         count = min(pass_size(sensor), spp - done)
         part = tracer.render(scene, sensor, seed=_seed(seed + 0xB5, done), spp=count)

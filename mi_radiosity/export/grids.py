@@ -78,11 +78,13 @@ def plane_grid(model: Model, text: str, spacing: float | None = None) -> Grid:
 def shape_grid(model: Model, name: str, spacing: float | None = None) -> Grid:
     """Points over a shape, known by its id: each of its flat surfaces has a grid along its own edges, of one point at
     least. Raises RadiosityError that lists the names if there is no such shape."""
-    names = [shape.id() for shape in model.scene.shapes()]
-    if name not in names:
-        raise RadiosityError(f"there is no shape '{name}': choose one of {', '.join(filter(None, names))}")
-    faces = model.faces
-    chosen = np.flatnonzero((faces.shape == names.index(name)) & ~faces.degenerate)
+    faces, shapes = model.faces, model.scene.shapes()
+    names = [{part.shape.id(), shapes[part.number].id()} for part in faces.parts]  # of members of instances, two
+    named = [number for number, own in enumerate(names) if name in own]
+    if not named:
+        known = ", ".join(sorted(set().union(*names) - {""}))
+        raise RadiosityError(f"there is no shape '{name}': choose one of {known}")
+    chosen = np.flatnonzero(np.isin(faces.shape, named) & ~faces.degenerate)
     if not len(chosen):
         raise RadiosityError(f"the shape '{name}' has no area: nothing can be measured on it")
     corners, normal = faces.corners[chosen], faces.normal[chosen]

@@ -17,6 +17,7 @@ from .tessellate import UNMESHED, Part, children, parts
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
+GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
@@ -49,9 +50,13 @@ class Materials:
             (self.rho > 1 + ROUNDING).any(axis=(0, 2)),
             "has a reflectance of more than 1, which makes energy from nothing: make it less than 1",
         )
+        tinted = [part.shape.interior_medium() is not None for part in faces.parts]
+        if any(tinted):
+            where = faces.names(np.array(tinted)[faces.shape])
+            faces.warnings.append(f"{where}: the medium inside the glass is not modelled, and taken to be clear")
         white = self.rho > WHITEST
         if white.any():
-            where = faces.names(white.any(axis=(0, 2)))
+            where = faces.names(np.asarray(white.any(axis=(0, 2))))
             faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
             self.rho = np.minimum(self.rho, WHITEST)
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
@@ -150,13 +155,18 @@ def _inspect_shape(shape):
         yield "shapes of this kind are not modelled: export it as a mesh"
 
 
+def is_glass(shape: "mi.Shape") -> bool:
+    """Is ``shape`` of glass, so that a medium inside tints it, and no ray is lost in it for want of the medium?"""
+    return shape.bsdf().class_name() in GLASS
+
+
 def inspect_part(part: Part) -> Iterator[str]:
     """What is wrong with a part of a scene."""
     shape = part.shape
     if not part.can_mesh:
         yield from _inspect_shape(shape)
         return
-    if shape.interior_medium() is not None or shape.exterior_medium() is not None:
+    if (shape.interior_medium() is not None and not is_glass(shape)) or shape.exterior_medium() is not None:
         yield "participating media are not modelled: remove the medium"
     if shape.is_emitter() and shape.emitter().get_medium() is not None:
         yield "its emitter is in a medium, and those are not modelled: remove the medium"

@@ -10,6 +10,7 @@ from .lights import Lights
 from .rays import Rays
 
 GLANCES, PROBES = 4, 32  # rays per side that look for light: of all, and of those that found none
+FEW = 1 << 14  # sides: so many look with all their rays at once
 MOST_PROBES = 1 << 23  # rays of all sides together, where there are that many
 LAMP_PROBES = 1 << 16  # rays from all lamps together
 
@@ -28,7 +29,9 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
     lit = emits | _met_by_free(rays, lights)
     links = [_from_lamps(rays, np.flatnonzero(emits))] if emits.any() else []
     dark = np.arange(patches.count)
-    for first, last in ((0, GLANCES), (GLANCES, max(2 * GLANCES, min(PROBES, MOST_PROBES // patches.count)))):
+    probes = max(2 * GLANCES, min(PROBES, MOST_PROBES // patches.count))
+    glances = PROBES if patches.count <= FEW else GLANCES
+    for first, last in ((0, glances), (glances, probes)):
         source, number = np.repeat(dark, last - first), np.tile(np.arange(first, last), len(dark))
         target, escaped = _cast(rays, source, number)
         links.append((source, target))
@@ -41,7 +44,7 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
         label = components(patches.count, a[b != NONE], b[b != NONE])
         found = np.isin(label, label[lit])
         dark = np.flatnonzero(~found)
-        if len(dark) == 0:
+        if len(dark) == 0 or last >= probes:
             break
     return found
 

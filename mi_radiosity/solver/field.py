@@ -93,8 +93,8 @@ class Field:
         return dr.select(walled & ~alone, seen / weights, total)
 
     def _without_nodes(self, leaf, x, total, active):
-        """H at points x of walled leaves that see no node, and know nothing of some: the leaf's own if light came down in sight, nothing if it
-        came down elsewhere, and ``total`` where that is not known (Color3f [n])."""
+        """H at points x of walled leaves that see no node, and know nothing of some: the leaf's own if light came down
+        in sight, nothing if it came down elsewhere, and ``total`` where that is not known (Color3f [n])."""
         if self._solution.landings.slots == 0:
             return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)

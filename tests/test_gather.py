@@ -1,0 +1,159 @@
+"""Light gathered at leaves and pixels: unbiased, exact in its budget, better than shooting, as sharp as paths."""
+
+import mi_radiosity as mr
+from mi_radiosity.display.pixels import PixelPoints
+from mi_radiosity.evaluation.metrics import rmse
+from mi_radiosity.evaluation.reference import path_image
+from mi_radiosity.transport.lamps import LampChoice
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import diffuse, lamp, rectangle, scene
+from scipy import stats
+
+T = mi.ScalarTransform4f
+
+
+def small(cornell_dict):
+    """The Cornell box on a film of 64 × 64 box-filtered pixels."""
+    cornell_dict["sensor"]["film"] |= {"width": 64, "height": 64, "rfilter": {"type": "box"}}
+    return mi.load_dict(cornell_dict)
+
+
+@pytest.fixture(scope="module")
+def box():
+    return small(mi.cornell_box())
+
+
+@pytest.fixture(scope="module")
+def solution(box):
+    return mr.solve(box, elements=2000, rays=400_000)
+
+
+@pytest.fixture(scope="module")
+def reference(box):
+    return path_image(box, box.sensors()[0], 4096)
+
+
+def test_all_rays_are_counted(solution):
+    found = solution.stats
+    assert found["rays"] == 400_000 == found["power_rays"] + found["gather_rays"]
+    assert 0.7 * 400_000 < found["gather_rays"] <= 0.8 * 400_000
+
+
+def test_too_few_rays_to_gather_are_all_shot(box):
+    assert mr.solve(box, elements=2000, rays=4000).stats["gather_rays"] == 0
+
+
+def test_gathering_is_better_than_shooting(box, reference):
+    """Three quarters of the error at as many rays: a leaf's own rays serve it better than those that chance upon it."""
+    errors = {}
+    for share in (0.8, 0.0):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("mi_radiosity.transport.gathering.SHARE", share)
+            image = np.array(mr.solve(box, elements=2000, rays=200_000).render(spp=64))[..., :3]
+        errors[share] = rmse(image, reference)
+    assert errors[0.8] < 0.75 * errors[0.0]
+
+
+def test_noise_of_gathering_falls_with_rays():
+    """In a furnace nothing but noise is wrong: slope −½ or steeper in rays."""
+    room = scene(box={"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5), "emitter": lamp()})
+    rays, noise = 4 ** np.arange(4) * 20_000, []
+    for n in rays:
+        leaves = mr.solve(room, mr.Uniform(), elements=768, rays=int(n)).leaves()
+        noise.append(np.average(np.abs(leaves.radiosity[:, 0] / 2 - 1), weights=leaves.area))
+    assert np.polyfit(np.log(rays), np.log(noise), 1)[0] < -0.5
+
+
+@pytest.mark.parametrize("shading", ["gather", "direct"])
+def test_pixels_that_gather_agree_with_path(solution, reference, shading):
+    """Means to 0.5 %; and gather is as sharp: closer to path than the field, whose shadows are those of elements."""
+    image = np.array(solution.render(spp=256, shading=shading))[..., :3]
+    assert image.mean() == pytest.approx(reference.mean(), rel=0.005)
+    field = np.array(solution.render(spp=256))[..., :3]
+    assert rmse(image, reference) < (0.6 if shading == "gather" else 1.0) * rmse(field, reference)
+
+
+def test_walls_keep_gathered_light():
+    """Behind a wall that elements cross nothing is seen, not a bit, at any pixel."""
+    down = T().translate([2.5, 0, 4.9]).rotate([1, 0, 0], 180)
+    room = {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5), "to_world": T().scale(5)}
+    wall = {"type": "cube", "bsdf": diffuse(0.5), "to_world": T().translate([-1.3, 0, 0]).scale([0.0005, 5, 5])}
+    parts = scene(optimize=False, room=room, wall=wall, light=rectangle(down, bsdf=diffuse(0.5), emitter=lamp()))
+    solution = mr.solve(parts, elements=1500, rays=200_000)
+    film = {"type": "hdrfilm", "width": 32, "height": 32}
+    eye = T().look_at([-4.5, 0.1, 0.1], [-1.3, 0, -5], [0.3, 0.2, 1])
+    camera = mi.load_dict({"type": "perspective", "fov": 80, "to_world": eye, "film": film})
+    for shading in ("gather", "direct", "gouraud"):
+        assert np.array(solution.render(camera, spp=64, shading=shading)).max() == 0
+
+
+# ---- Lamps -----------------------------------------------------------------------------------------
+
+
+def test_lamps_are_drawn_as_often_as_their_density_says():
+    """χ² at 99.9 %: for places on three leaves, and for places nobody knows."""
+    lamps = {
+        f"lamp{k}": rectangle(
+            T().translate([k - 2, 0, 2]).rotate([1, 0, 0], 180).scale(0.2 + 0.1 * k), emitter=lamp(1 + k)
+        )
+        for k in range(5)
+    }
+    solution = mr.solve(scene(floor=rectangle(T().scale(4), bsdf=diffuse()), **lamps), elements=200, rays=20_000)
+    choice, n = LampChoice(solution.model, solution.elements), 100_000
+    area = np.array(solution.model.patches.area)
+    lot = mi.Float(np.random.default_rng(0).random(n).astype(np.float32))
+    for leaf in (None, *np.array(solution.elements.leaves)[[0, 50, 150]]):
+        places = None if leaf is None else dr.full(mi.UInt32, int(leaf), n)
+        patch, density = choice.draw(lot, places)
+        patch, density = np.array(patch), np.array(density)
+        lamp_patches = np.array(choice.lamps)
+        one = None if leaf is None else dr.full(mi.UInt32, int(leaf), len(lamp_patches))
+        expected = np.array(choice.density(mi.UInt32(lamp_patches), one)) * area[lamp_patches]
+        assert expected.sum() == pytest.approx(1, rel=1e-5)
+        counts = np.array([(patch == p).sum() for p in lamp_patches])
+        assert stats.chisquare(counts, expected * (n / expected.astype(float).sum()), sum_check=False).pvalue > 0.001
+        assert density * area[patch] == pytest.approx(expected[np.searchsorted(lamp_patches, patch)], rel=1e-4)
+
+
+# ---- Camera samples --------------------------------------------------------------------------------
+
+
+def test_camera_samples_are_uniform():
+    """χ² at 99.9 % of the first numbers of many pixels, 5 samples each: pairs, and pairs of different draws."""
+    points = PixelPoints(20_000, 0, 5, 5, seed=3)
+    a, b, c = points.next_2d(), points.next_2d(), points.next_1d()
+    for x, y in ((a.x, a.y), (b.x, b.y), (a.x, b.y), (a.y, c)):
+        table = np.histogram2d(np.array(x), np.array(y), bins=8, range=((0, 1), (0, 1)))[0]
+        assert stats.chisquare(table.ravel()).pvalue > 0.001
+
+
+def test_camera_samples_are_well_spread():
+    """The mean over 16 samples of a smooth function has a tenth of the variance of independent ones, and no bias."""
+    pixels, count = 4096, 16
+    points = PixelPoints(pixels, 0, count, count, seed=1)
+    p = points.next_2d()
+    values = np.array(dr.block_sum(dr.sin(3 * p.x) * p.y, count)) / count
+    exact = (1 - np.cos(3)) / 3 / 2
+    second = (0.5 - np.sin(6) / 12) / 3
+    independent = (second - exact**2) / count
+    assert values.var() < 0.1 * independent
+    assert abs(values.mean() - exact) < 3.3 * (values.var() / pixels) ** 0.5
+
+
+def test_passes_of_a_picture_continue_each_other():
+    """Samples drawn in two passes are those of one."""
+    whole, parts = PixelPoints(10, 0, 8, 8, seed=0).next_2d().x, []
+    for first in (0, 4):
+        parts.append(np.array(PixelPoints(10, first, 4, 8, seed=0).next_2d().x).reshape(10, 4))
+    np.testing.assert_array_equal(np.array(whole).reshape(10, 8), np.concatenate(parts, axis=1))
+
+
+def test_denoised_pictures_are_closer(solution, reference):
+    pytest.importorskip("mitsuba_oidn")
+    plain, clean = (np.array(solution.render(spp=16, shading="gather", denoise=d))[..., :3] for d in (False, True))
+    assert rmse(clean, reference) < 0.7 * rmse(plain, reference)
+    assert clean.mean() == pytest.approx(reference.mean(), rel=0.01)
