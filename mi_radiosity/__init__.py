@@ -12,10 +12,11 @@ from .display import Shader
 from .display import register as _register
 from .export import export
 from .export import view as _view
+from .export.factors import read_factors, write_factors
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
 from .solver import Solution, solve
-from .transport import Shooting, Transport
+from .transport import Shooting, Transport, ViewFactors, view_factors
 
 __version__ = "0.2.0"
 __all__ = [
@@ -33,10 +34,14 @@ __all__ = [
     "Solution",
     "Transport",
     "Uniform",
+    "ViewFactors",
     "export",
     "information_gap",
     "mesher",
+    "read_factors",
     "solve",
+    "view_factors",
+    "write_factors",
 ]
 
 Solution.view = _view  # type: ignore[attr-defined]  # rooms below do not know of this one

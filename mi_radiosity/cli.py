@@ -14,6 +14,7 @@ from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
 from .export.commands import add_commands as add_export_commands
 from .export.commands import recall_scene
+from .export.commands_factors import add_view_factors
 from .export.commands_measure import add_measure
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
@@ -25,7 +26,13 @@ if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     from .solver.cost import Cost
 
 PROGRAM = "mi-radiosity"
-STAGES = {"refine": "Refining", "distribute": "Distributing power"}
+STAGES = {
+    "refine": "Refining",
+    "distribute": "Distributing power",
+    "trace": "Tracing rays",
+    "connect": "Connecting facets",
+    "write": "Writing",
+}
 SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")
 
 Report = Callable[[str, int, int | None], None]
@@ -68,6 +75,7 @@ def _parser() -> Parser:
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
+    add_view_factors(commands, _scene_arguments, progress_bars)
     add_measure(commands, _solution_arguments, progress_bars)
     add_export_commands(commands, _loading_arguments, progress_bars)
     return parser

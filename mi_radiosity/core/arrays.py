@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 NONE = 0xFFFFFFFF  # "no patch", "no element", "no pair"
+DTYPES = {"Float": np.float32, "Float64": np.float64}
 WEIGHTS = 2.0**46  # resolution of a Distribution
 
 
 def owned(kind: type, array: ArrayLike) -> "dr.ArrayBase":
-    """A Dr.Jit array (mi.Float or mi.UInt32) with a copy of a NumPy array of one dimension.
+    """A Dr.Jit array (mi.Float, mi.Float64 or mi.UInt32) with a copy of a NumPy array of one dimension.
 
     Without the copy Dr.Jit reads NumPy's memory, and has its alignment in the kernels.
     """
-    kept = np.array(array, dtype=np.float32 if kind is mi.Float else np.uint32, order="C")  # the copy is made later
+    kept = np.array(array, dtype=DTYPES.get(kind.__name__, np.uint32), order="C")  # the copy is made later
     copy = dr.empty(kind, len(kept))
     if len(kept):
         dr.scatter(copy, kind(kept), dr.arange(mi.UInt32, len(kept)))

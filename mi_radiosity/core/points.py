@@ -30,6 +30,7 @@ class Stream(IntEnum):
     ALBEDO = 7  # directions that the albedo of a diffuse lobe is found with
     PIXELS = 9  # camera samples
     LOBES = 8  # what lobes rays draw on their way
+    FACTORS = 10  # rays and lines that view factors are made of
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

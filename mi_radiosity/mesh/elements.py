@@ -59,6 +59,12 @@ class Elements:
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
 
+    def with_light(self, patches: Patches, exitance: "mi.Color3f | None") -> "Elements":
+        """The same elements of patches that differ in their emission only."""
+        other = Elements(patches, {name: getattr(self, name) for name in ARRAYS}, exitance)
+        vars(other)["leaves"] = self.leaves  # sorted once for all
+        return other
+
     def level(self, element: "mi.UInt32") -> "mi.UInt32":
         """How often the patch was split (UInt32 [n])."""
         return dr.gather(mi.UInt32, self.place, element) & 15

@@ -1,5 +1,6 @@
 """Lamps: one class per kind, and all lamps of a scene behind one face."""
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import opaque_index, owned, totals
+from ..core.arrays import opaque_index, owned, owned_vectors, totals
 from ..core.errors import RadiosityError
 from ..core.plugins import Registry
 from ..core.points import kronecker, triangle
@@ -29,6 +30,7 @@ class Light:
 
     emitters: tuple[str, ...] = ()
     on_surface = False
+    color: Any = 1.0  # what rays see of it that leave the scene is multiplied by
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -229,11 +231,12 @@ class Lights:
     """The lamps of a scene: ``exitance`` of its faces, the mean of each, W/m² [faces, 3], and the ``free`` ones that
     are no surfaces; ``textured``: does the exitance vary over a face?
 
-    Raises RadiosityError if there is no light, or if a lamp's is impossible, naming the shape.
+    Raises RadiosityError if there is no light where it is ``required``, or if a lamp's is impossible, naming the shape.
     """
 
-    def __init__(self, faces: Faces) -> None:
-        self._faces = faces
+    def __init__(self, faces: Faces, required: bool = True) -> None:
+        self._faces, self.required = faces, required
+        self._dim: Any = None
         emitters = [part.shape.emitter() for part in faces.parts]
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
         self._kinds = list(dict.fromkeys(kind for kind in kinds if kind and kind.on_surface))
@@ -245,7 +248,8 @@ class Lights:
             self._shape = owned(mi.UInt32, faces.shape)
         self.exitance = self._of_faces(np.flatnonzero(np.array(lamps)[faces.shape]))
         self.free = self._free()
-        if not (self.exitance * faces.area[:, None]).any() and not any(any(light.power()) for light in self.free):
+        lit = (self.exitance * faces.area[:, None]).any() or any(any(light.power()) for light in self.free)
+        if required and not lit:
             raise RadiosityError("the scene has no light: add a lamp, such as an 'area' emitter of a shape")
 
     def _of_faces(self, lamps):
@@ -269,6 +273,14 @@ class Lights:
         lights = [kind(emitter, scene, *box) for emitter, kind in kinds if not kind.on_surface]
         return sorted(lights, key=lambda light: light.fingerprint())
 
+    def dimmed(self, shapes: np.ndarray, free: "list[Light]") -> "Lights":
+        """The same lamps, exitance times ``shapes`` [shapes of faces.tracing, 3], and ``free`` in the place of those
+        that are no surfaces."""
+        other = copy.copy(self)
+        other.exitance, other.free = self.exitance * shapes[self._faces.shape], free
+        other._dim = owned_vectors(mi.Color3f, shapes)
+        return other
+
     # ---- Light at points and in directions -----------------------------------------------------
 
     def exitance_at(
@@ -281,6 +293,8 @@ class Lights:
             emitter, which = (dr.gather(type(x), x, shape, active) for x in (self._emitters, self._kind))
             for number, kind in enumerate(self._kinds):
                 total += dr.select(active & (which == number), kind.exitance(emitter, si), 0)
+            if self._dim is not None:
+                total *= dr.gather(mi.Color3f, self._dim, shape, active)
         return total
 
     def mean_exitance(self, face: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float") -> "mi.Color3f":
@@ -309,7 +323,8 @@ class Lights:
             return mi.Color3f(0)
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(direction))
         si.wi = -direction
-        return dr.pi * dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
+        seen = dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
+        return dr.pi * seen * self.sky_light.color
 
     @property
     def sky_light(self) -> Light | None:

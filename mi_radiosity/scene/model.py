@@ -19,27 +19,29 @@ from .state import State
 class Model:
     """A Mitsuba scene read once: ``faces``, ``materials``, ``lights``, ``patches`` and the ``rays`` between them.
 
-    sides: patches to make (see `Patches`); by default those that light can reach. ``warnings``: what a user should
-    know (list of str). ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry,
-    orientation, reflectance, emission and lamps. ``state``: what the scene was like when it was read.
+    sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
+    not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many
+    sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance, emission and lamps.
+    ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
 
-    def __init__(self, scene: "mi.Scene", sides: np.ndarray | None = None) -> None:
+    def __init__(self, scene: "mi.Scene", sides: np.ndarray | None = None, lit: bool = True) -> None:
         require_variant()
         require_supported(scene)
         self.scene, self.state = scene, State(scene)
         self.faces = Faces(scene)
         self.materials = Materials(self.faces)
-        self.lights = Lights(self.faces)
+        self.lights = Lights(self.faces, required=lit)
         self.fingerprint = self._fingerprint()
         overlaps = self._find_overlaps()
         self.unreached = 0
         if sides is None:
-            candidates = self._sides(self._candidate & ~overlaps.covered)
-            lit = reached(self._rays(candidates, overlaps), self.lights)
-            sides, self.unreached = candidates[lit], int((~lit).sum())
+            sides = self._sides(self._candidate & ~overlaps.covered)
+            if lit:
+                found = reached(self._rays(sides, overlaps), self.lights)
+                sides, self.unreached = sides[found], int((~found).sum())
         kept, doubled = overlaps.among(self._numbers(sides))
         self.rays = self._rays(sides, kept)
         self.patches = self.rays.patches
@@ -47,7 +49,7 @@ class Model:
 
     def with_sides(self, sides: np.ndarray) -> "Model":
         """The same scene with other patches."""
-        return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides)
+        return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides, self.lights.required)
 
     def _find_overlaps(self):
         """Faces in one another: one of them is lit and shown wherever several are."""
@@ -56,7 +58,7 @@ class Model:
         emits = self.lights.exitance.any(axis=1)[:, None] & [True, False]
         # A side without a diffuse lobe receives nothing: what meets it goes on.
         lobe = ~self.materials.traced[f.shape][:, None] | self.materials.rho.any(axis=2).T | emits
-        self._candidate = there & lobe
+        self._candidate = there & lobe if self.lights.required else there
         exitance = self.lights.exitance.sum(axis=1)
         return find_overlaps(
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, lift_of(f)

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -20,12 +20,14 @@ from ..mesh import Elements, Exposure
 from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
 from ..scene import Model
+from ..scene.lamps import Lamps
 from ..scene.nearest import nearest_face
 from ..scene.patches import lift_of
-from ..transport import Gatherer
+from ..transport import Gatherer, ViewFactors, view_factors
 from ..transport.landings import Landings
 from ..transport.probe import probe
 from .field import Field
+from .layers import Layers, Scales
 
 FORMAT = 3
 TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
@@ -60,7 +62,7 @@ class Solution:
     model: the scene as patches. elements: the mesh. exposure: what of it is open. direct, indirect: irradiance H in
     W/m² (Color3f [elements]) from the first flight of the lamps' light and from all later ones; interior elements
     hold the area average. landings: where light came down on leaves that a wall crosses. stats: the numbers of the
-    run (see README).
+    run (see README). layers: the light of every lamp by itself, if it was asked for.
     """
 
     model: Model
@@ -70,6 +72,7 @@ class Solution:
     indirect: "mi.Color3f"
     landings: Landings
     stats: dict
+    layers: Layers | None = None
 
     def irradiance(
         self,
@@ -190,6 +193,26 @@ class Solution:
         integrator.show(self, shading)
         return integrator.picture(self.model.scene, sensor, seed, spp, denoise)
 
+    def relight(self, scales: Scales) -> "Solution":
+        """The solution with lamps dimmed or recoloured, exact by superposition, and without a ray.
+
+        scales: by the lamps' names (ids of their shapes) or numbers, what their emission in the scene is multiplied by:
+        one number or RGB; lamps that are not named stay as the scene has them. The scene itself is left alone.
+        Raises RadiosityError if it was solved without layers, for unknown lamps and impossible scales.
+        """
+        if self.layers is None:
+            raise RadiosityError("this solution keeps no light by lamp: solve with layers=True")
+        values = self.layers.read(scales)
+        light, stats = self.layers.summed(values), self.stats | {"power": self.layers.balance(values)}
+        return Solution(exposure=self.exposure, stats=stats, **light)
+
+    def view_factors(self, level: str = "face", rays: int | None = None, **options: Any) -> ViewFactors:
+        """View factors between shapes, faces or leaves of the mesh, those that light can reach.
+
+        level: "shape", "face" or "leaf"; rays and further options as in `mi_radiosity.view_factors`.
+        """
+        return view_factors(self.model, level, rays, elements=self.elements, **options)
+
     def require_unchanged(self) -> None:
         """Raise RadiosityError if the scene is not as it was when it was solved."""
         if not self.model.state.same_as(self.model.scene):
@@ -207,6 +230,7 @@ class Solution:
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
+        arrays |= self.layers.arrays() if self.layers else {}
         arrays |= {"landings": np.array([self.landings.u, self.landings.v]).reshape(2, -1)}
         with writing(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
@@ -253,7 +277,11 @@ class Solution:
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)
-        return Solution(model, elements, exposure, direct, indirect, Landings(slots, *data["landings"]), stats)
+        solution = Solution(model, elements, exposure, direct, indirect, Landings(slots, *data["landings"]), stats)
+        if "lamps" not in data:
+            return solution
+        layers = Layers.load(data, Lamps(model), elements)
+        return replace(solution, layers=layers).relight(dict(enumerate(layers.scales)))
 
 
 def _read(path):

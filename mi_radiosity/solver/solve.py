@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.arrays import totals
 from ..core.errors import RadiosityError, interruptible
@@ -12,7 +13,9 @@ from ..core.points import Stream, stream_seed
 from ..mesh import Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
+from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Shooting, Transport
+from .layers import POWERS, solve_layers
 from .refine import Refinement
 from .solution import Solution
 
@@ -32,6 +35,7 @@ def solve(
     seed: int = 0,
     transport: Transport | None = None,
     pilot: Transport = PILOT,
+    layers: bool = False,
     progress: Callable[[str, int, int | None], None] | None = None,
 ) -> Solution:
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
@@ -43,7 +47,8 @@ def solve(
     elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
-    default. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
+    default. layers: keep the light of every lamp by itself, for `Solution.relight`; the rays are shared out by the
+    lamps' power. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
     it is not known).
 
     Returns a Solution. Raises RadiosityError for options and scenes that cannot be used.
@@ -75,29 +80,41 @@ def solve(
     clock.lap("refine")
 
     rays = int(rays or default_rays(tree.leaf_count))
-    gathering = Gathering(problem, rays, seed)
-    shot = rays - gathering.rays
-    flow = transport(
-        problem,
-        shot,
-        stream_seed(seed, Stream.POWER),
-        refinement.first_share,
-        lambda done: report("distribute", done, rays),
-    )
-    power = _balance(problem, flow)
-    flow = gathering.feed(flow, lambda done: report("distribute", shot + done, rays))
+    shot = 0
+
+    def carry(problem, rays_here, number=0, before=0):
+        """Transport with a part of the rays; returns a Flow and its power balance."""
+        nonlocal shot
+        gathering = Gathering(problem, rays_here, seed)
+        count = rays_here - gathering.rays
+        shot += count
+        stream = stream_seed(seed, Stream.POWER, number)
+        flow = transport(
+            problem, count, stream, refinement.first_share, lambda done: report("distribute", before + done, rays)
+        )
+        power = _balance(problem, flow)
+        return gathering.feed(flow, lambda done: report("distribute", before + count + done, rays)), power
+
+    if layers:
+        kept, flows = solve_layers(problem, rays, carry, Lamps(model))
+        light, power = kept.summed(kept.scales), kept.balance(kept.scales)
+    else:
+        flow, balance = carry(problem, rays)
+        flows, power = [flow], dict(zip(POWERS, balance.sum(axis=1).tolist()))
+        light = {name: getattr(flow, name) for name in ("direct", "indirect", "landings")}
+        light |= {"model": model, "elements": mesh}
     clock.lap("distribute")
 
     stats = {
         "elements": tree.leaf_count,
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
-        "rays": flow.rays,
+        "rays": sum(flow.rays for flow in flows),
         "power_rays": shot,
-        "gather_rays": gathering.rays,
+        "gather_rays": rays - shot,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0,
         "pilot_rays": refinement.rays,
-        "iterations": flow.iterations,
+        "iterations": max(flow.iterations for flow in flows),
         "power": power,
         "seconds": clock.seconds(),
         "epsilon": refinement.epsilon,
@@ -105,8 +122,8 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
-    }
-    return Solution(model, mesh, problem.exposure, flow.direct, flow.indirect, flow.landings, stats)
+    } | ({"lamps": list(kept.names)} if layers else {})
+    return Solution(exposure=problem.exposure, stats=stats, **light)
 
 
 def _check(oracle, elements, epsilon, rays, lines):
@@ -161,7 +178,7 @@ class _Clock:
 
 
 def _balance(problem, flow):
-    """Emitted, absorbed, escaped and unshot power of a transport in W, channels added up.
+    """Emitted, absorbed, escaped and unshot power of a transport, W [POWERS, 3].
 
     What is absorbed comes from its irradiance, not from counting rays.
     """
@@ -169,9 +186,5 @@ def _balance(problem, flow):
     irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)
     lost = 1 - dr.gather(mi.Color3f, elements.reflectance, leaves)
     absorbed = lost * irradiance * dr.gather(mi.Float, problem.exposure.open_area, leaves)
-    return {
-        "emitted": sum(flow.emitted),
-        "absorbed": sum(totals([mi.Float64(a) for a in absorbed])) + sum(flow.blocked),
-        "escaped": sum(flow.escaped),
-        "unshot": sum(flow.unshot),
-    }
+    absorbed = np.array(totals([mi.Float64(a) for a in absorbed])) + flow.blocked
+    return np.array([flow.emitted, absorbed, flow.escaped, flow.unshot])

@@ -1,0 +1,146 @@
+"""One layer of light per lamp: sums of them, scaled, are the light of lamps dimmed and recoloured."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import owned, owned_vectors
+from ..core.errors import RadiosityError
+from ..core.points import hash_pair
+from ..mesh import Elements
+from ..scene.lamps import Lamps
+from ..transport import Problem
+from ..transport.landings import SEATS, Landings
+from ..transport.series import LEAST_RAYS
+
+Scales = Mapping[str | int, float | tuple[float, float, float]]  # of lamps, by name or number
+POWERS = ("emitted", "absorbed", "escaped", "unshot")
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Light of every lamp as the scene has it, on one mesh.
+
+    lamps: who they are. elements: the mesh, with the emission of the scene. direct, indirect: irradiance, W/m² (float32
+    [lamps, 3, elements]). u, v: landings [lamps, seats] (see `Landings`). power: W [POWERS, lamps, 3]. scales: those
+    of the solution that these layers belong to [lamps, 3].
+    """
+
+    lamps: Lamps
+    elements: Elements
+    direct: np.ndarray
+    indirect: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    power: np.ndarray
+    scales: np.ndarray
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.lamps.names
+
+    def read(self, scales: Scales) -> np.ndarray:
+        """Scales [lamps, 3] from a mapping; lamps it does not name stay as the scene has them.
+
+        Raises RadiosityError for lamps there are none of, and for scales that are no light.
+        """
+        result = np.ones((len(self.lamps), 3))
+        for lamp, scale in scales.items():
+            number = self.names.index(lamp) if lamp in self.names else lamp
+            if not isinstance(number, int | np.integer) or not 0 <= number < len(self.lamps):
+                raise RadiosityError(f"there is no lamp {lamp!r}: choose from {', '.join(self.names)}")
+            values = np.asarray(scale, dtype=np.float64)
+            if values.shape not in ((), (3,)) or not np.isfinite(values).all() or (values < 0).any():
+                raise RadiosityError(f"the scale of lamp {lamp!r} must be one number ≥ 0 or three, not {scale!r}")
+            result[number] = values
+        return result
+
+    def summed(self, scales: np.ndarray) -> dict:
+        """What of a Solution changes with the light: Σ_l s_l H_l, exact by superposition."""
+        model = self.lamps.dimmed(scales)
+        direct, indirect = (
+            owned_vectors(mi.Color3f, np.einsum("lc,lce->ec", scales, h)) for h in (self.direct, self.indirect)
+        )
+        return {
+            "model": model,
+            "elements": _lit(self.elements, self.lamps, model, scales),
+            "direct": direct,
+            "indirect": indirect,
+            "landings": self._landings(scales),
+            "layers": replace(self, scales=scales),
+        }
+
+    def balance(self, scales: np.ndarray) -> dict[str, float]:
+        """Power by where it went, W, channels added up."""
+        return dict(zip(POWERS, map(float, (self.power * scales).sum(axis=(1, 2)))))
+
+    def _landings(self, scales):
+        """Every seat goes to one of the lamps that are on and came down on its leaf, drawn at random."""
+        u, v = (x[scales.any(axis=1)] for x in (self.u, self.v))
+        known, seats = ~np.isnan(u), np.arange(u.shape[1])
+        count = known.sum(axis=0)
+        lot = np.array(hash_pair(owned(mi.UInt32, seats), mi.UInt32(1))) if len(seats) else seats
+        chosen = (np.cumsum(known, axis=0) == lot % np.maximum(count, 1) + 1) & known
+        who = chosen.argmax(axis=0) if len(u) else np.zeros(0, int)
+        points = [np.where(count > 0, x[who, seats], np.nan) if len(u) else np.full(u.shape[1], np.nan) for x in (u, v)]
+        return Landings(u.shape[1] // SEATS, *points)
+
+    # ---- Files ---------------------------------------------------------------------------------
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What an archive keeps."""
+        names = ("direct", "indirect", "u", "v", "power", "scales")
+        return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in names}
+
+    @staticmethod
+    def load(data: Mapping[str, np.ndarray], lamps: Lamps, elements: Elements) -> "Layers":
+        """The layers in the arrays of an archive. Raises KeyError if some are missing."""
+        names = ("direct", "indirect", "u", "v", "power", "scales")
+        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in names})
+
+
+def solve_layers(
+    problem: Problem, rays: int, carry: Callable[[Problem, int, int, int], tuple], lamps: Lamps
+) -> tuple[Layers, list]:
+    """Carry the power of every lamp by itself; returns the layers and their Flows.
+
+    carry(problem, rays, number, done) transports the power of the lamp of a number, after ``done`` rays, and returns
+    its Flow and its power [POWERS, 3]. Rays are shared out by power, LEAST_RAYS each at least.
+    """
+    flows, powers, done = [], [], 0
+    for number, (share, only) in enumerate(zip(_shares(lamps, rays), _one_by_one(len(lamps)))):
+        model = lamps.dimmed(only)
+        one = replace(problem, model=model, elements=_lit(problem.elements, lamps, model, only))
+        flow, power = carry(one, share, number, done)
+        flows.append(flow)
+        powers.append(power)
+        done += share
+
+    def stack(name):
+        return np.array([np.array(getattr(flow, name), dtype=np.float32).reshape(3, -1) for flow in flows])
+
+    u, v = (np.array([np.array(getattr(flow.landings, x)) for flow in flows]) for x in "uv")
+    power, ones = np.array(powers).swapaxes(0, 1), np.ones((len(lamps), 3))
+    return Layers(lamps, problem.elements, stack("direct"), stack("indirect"), u, v, power, ones), flows
+
+
+def _lit(elements, lamps, model, scales):
+    """Elements with the emission of a dimmed model."""
+    return elements.with_light(model.patches, lamps.exitance(elements.exitance, elements.patch, scales))
+
+
+def _one_by_one(count):
+    for k in range(count):
+        yield np.repeat(np.eye(count)[k][:, None], 3, axis=1)
+
+
+def _shares(lamps, rays):
+    """Whole numbers of rays for the lamps that add up to ``rays``, in proportion to their power (list)."""
+    spare = rays - LEAST_RAYS * len(lamps)
+    if spare < 0:
+        raise RadiosityError(f"{rays} rays are too few for {len(lamps)} lamps: give at least {rays - spare}")
+    power = lamps.power.sum(axis=1)
+    ends = np.round(np.cumsum(power) / power.sum() * spare).astype(np.int64)
+    return (np.diff(ends, prepend=0) + LEAST_RAYS).tolist()
