@@ -119,7 +119,7 @@ def test_power_arrives_where_lines_to_the_lamp_say(name):
     x, y, s, t = kronecker(dr.arange(mi.UInt32, n), zero + 1, zero)
     point = mi.Point3f(1.5 * (2 * x - 1), 2 * y - 1, 0) - model.patches.origin
     up = mi.Vector3f(0, 0, 1)
-    sampled = light.lights_up(model.rays, point, up, s, t)
+    sampled, _ = light.lights_up(model.rays, point, up, s, t)
     assert shot == pytest.approx(np.array([dr.mean(h)[0] for h in sampled]), rel=0.01)
     if model.lights.sky_light:
         a, b, s, t = kronecker(dr.arange(mi.UInt32, n), zero + 2, zero)
@@ -139,7 +139,7 @@ def test_directionalarea_lights_what_is_straight_ahead():
     (light,) = solution.model.lights.free
     x, y, _, _ = kronecker(dr.arange(mi.UInt32, 1 << 16), mi.UInt32(0), mi.UInt32(0))
     point = mi.Point3f(1.5 * (2 * x - 1), 2 * y - 1, 0) - solution.model.patches.origin
-    H = light.lights_up(solution.model.rays, point, mi.Vector3f(0, 0, 1), x, y)
+    H, _ = light.lights_up(solution.model.rays, point, mi.Vector3f(0, 0, 1), x, y)
     below = 4 * 0.6 * 0.4 - 0.4 * 0.6  # the block is under a part of the lamp
     assert dr.mean(H.z)[0] * 6 == pytest.approx(3 * below, rel=0.01)
 

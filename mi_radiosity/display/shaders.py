@@ -135,7 +135,7 @@ class Gather(Shader):
         direction = cosine_direction(places.normal, to.x, to.y)
         side = dr.gather(mi.Vector3f, self.solution.model.patches.normal, look.hit.patch, look.lit)
         above = look.lit & (dr.dot(direction, side) > 0)
-        lines = self._gatherer.lines(places, lot, at.x, at.y, 1.0, look.lit)
+        lines, _ = self._gatherer.lines(places, lot, at.x, at.y, 1.0, look.lit)
         room, met = self._gatherer.rays(places, direction, number, seed, 1.0, above)
         return lines + met, room
 

@@ -98,7 +98,7 @@ class Dimmed(Light):
         return self._light.density(direction)
 
     def lights_up(self, rays: Any, *places: Any, **options: Any) -> "mi.Color3f":
-        return self._light.lights_up(rays, *places, **options) * self.color
+        return tuple(found * self.color for found in self._light.lights_up(rays, *places, **options))
 
     def fingerprint(self) -> bytes:
         return self._light.fingerprint()

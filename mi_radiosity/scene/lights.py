@@ -94,16 +94,16 @@ class Light:
         t: "mi.Float",
         active: "mi.Bool | bool" = True,
         rays_per_line: float = 0.0,
-    ) -> "mi.Color3f":
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
         """H at points x, relative to the patches' origin, with their normals: one `sample` each, weighed against the
-        rays that see the lamp (Color3f [n])."""
+        rays that see the lamp, and by itself (two Color3f [n])."""
         direction, distance, irradiance = self.sample(x + rays.patches.origin, s, t)
         cosine = dr.dot(direction, normal)
         lit = active & (cosine > 0) & (dr.max(irradiance) > 0)
         start = x + normal * rays.patches.lift
         hidden = rays.blocked(start, start + direction * distance, lit)
-        share = 1 - self.share_of_rays(direction, cosine, rays_per_line)
-        return dr.select(lit & ~hidden, irradiance * cosine * share, 0)
+        found = dr.select(lit & ~hidden, irradiance * cosine, 0)
+        return found * (1 - self.share_of_rays(direction, cosine, rays_per_line)), found
 
 
 class Area(Light):

@@ -100,6 +100,6 @@ def _see_free(rays, lights, source, number):
         x0, x1, s, t = kronecker(line, patch, dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH, 2 + k)))
         u, v = triangle(x0, x1)
         normal, on_top = dr.gather(mi.Vector3f, p.normal, patch), rays.on_top(patch, u, v)
-        sees = dr.max(light.lights_up(rays, p.point(patch, u, v), normal, s, t, on_top)) > 0
+        sees = dr.max(light.lights_up(rays, p.point(patch, u, v), normal, s, t, on_top)[1]) > 0
         found.append(source[np.array(sees).astype(bool)])
     return np.concatenate(found)

@@ -1,5 +1,6 @@
 """Light gathered where it is asked for: lines to the lamps, and rays into the solved room."""
 
+import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -39,6 +40,12 @@ class Gatherer:
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
 
+    def seeing(self, reflected: "mi.Color3f") -> "Gatherer":
+        """The same for other values of ρ H."""
+        other = copy.copy(self)
+        other._reflected = reflected
+        return other
+
     def lines(
         self,
         places: Places,
@@ -47,23 +54,26 @@ class Gatherer:
         t: "mi.Float",
         rays_per_line: float = 0.0,
         active: "mi.Bool | bool" = True,
-    ) -> "mi.Color3f":
-        """H from the lamps along lines to points of them (Color3f [n]): E F / (p + c F), p the density of the point.
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
+        """H from the lamps along lines to points of them: E F / (p + c F), p the density of the point, and E F / p,
+        which is all of it without `rays` (two Color3f [n]).
 
         lot, s, t: uniform numbers that draw a lamp and a point of it; rays_per_line: c, how many `rays` there are per
         line, which find lamps as well.
         """
         x, normal, rays = places.x, places.normal, self._model.rays
-        total = mi.Color3f(0)
+        shared, alone = mi.Color3f(0), mi.Color3f(0)
         if self._lamps.count:
             lamp, density = self._lamps.draw(lot, places.leaf)
             u, v = triangle(s, t)
             F = rays.kernel_at(x, normal, lamp, u, v, active)
-            shared = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
-            total += self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * (F / (density + shared))
+            by_rays = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
+            lit = self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * F
+            shared, alone = lit / (density + by_rays), lit / density
         for light in self._free:
-            total += light.lights_up(rays, x, normal, s, t, active, rays_per_line)
-        return total
+            found = light.lights_up(rays, x, normal, s, t, active, rays_per_line)
+            shared, alone = shared + found[0], alone + found[1]
+        return shared, alone
 
     def rays(
         self,

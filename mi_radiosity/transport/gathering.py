@@ -48,25 +48,30 @@ class Gathering:
         self._gatherer = Gatherer(self._problem.model, e, exposure, flow.landings, reflected)
         self._landings = Landings(exposure.slots)
         bound = 3 * [self._bound(flow)]
-        direct, indirect = (ColorSums(dr.width(e.leaves), bound) for _ in range(2))
-        whole = 1 / exposure.open_share(e, e.leaves)
+        direct, indirect, alone = (ColorSums(dr.width(e.leaves), bound) for _ in range(3))
         done = 0
         for line in (True, False):
             each = 1 if line else RAYS_PER_LINE
+            if not line:  # which meet the lamps' light as lines have found it
+                reflected = e.reflectance * (pull(e, self._means(alone), exposure.open_area) + flow.indirect)
+                self._gatherer = self._gatherer.seeing(reflected)
             start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
             for first in range(0, self._count * each, AT_ONCE):
                 n = min(AT_ONCE, self._count * each - first)
                 sample = opaque_index(first) + dr.arange(mi.UInt32, n)
-                self._sample(sample, start, line, direct, indirect)
+                self._sample(sample, start, line, direct, alone if line else indirect)
                 done += n
                 progress(done)
         fields = {}
-        lines = mi.Float64(owned(mi.Float, self._lines))
-        row = dr.arange(mi.UInt32, dr.width(e.leaves))
         for name, sums in (("direct", direct), ("indirect", indirect)):
-            values = [c / lines * mi.Float64(whole) for c in sums.gather(row)]
-            fields[name] = pull(e, self._scaled(values, flow, name), exposure.open_area)
+            fields[name] = pull(e, self._scaled(self._means(sums), flow, name), exposure.open_area)
         return dataclasses.replace(flow, rays=flow.rays + self.rays, landings=self._landings.settled(), **fields)
+
+    def _means(self, sums):
+        """Irradiance of the open part of the leaves from sums of their samples (3 Float64 [leaves])."""
+        e, lines = self._problem.elements, mi.Float64(owned(mi.Float, self._lines))
+        whole = mi.Float64(1 / self._problem.exposure.open_share(e, e.leaves))
+        return [c / lines * whole for c in sums.gather(dr.arange(mi.UInt32, dr.width(e.leaves)))]
 
     def _scaled(self, gathered, flow, name):
         """Gathered irradiance (3 Float64 [leaves]) that is absorbed in all as what was shot is, as far as that can be
@@ -90,8 +95,9 @@ class Gathering:
         most = emission + dr.max(dr.max(flow.direct + flow.indirect, axis=None))[0]
         return 1e3 * most * self._count
 
-    def _sample(self, sample, start, line, direct, indirect):
-        """Add up samples (UInt32 [n]): lines to lamps if ``line``, else rays into the room."""
+    def _sample(self, sample, start, line, direct, other):
+        """Add up samples (UInt32 [n]): lines to lamps if ``line``, else rays into the room. ``other`` sums what lines
+        find by themselves, and what rays find in the room."""
         problem = self._problem
         e, rays, patches = problem.elements, problem.model.rays, problem.model.patches
         row = lower_bound(start, sample + 1) - 1
@@ -106,16 +112,16 @@ class Gathering:
         places = Places(patches.point(patch, u, v), dr.gather(mi.Vector3f, patches.normal, patch), leaf)
         if line:
             lot = mi.radical_inverse_2(number, hash_pair(dr.gather(mi.UInt32, keys, row) ^ 0xA511E9B3, seed))
-            lamps, room = self._gatherer.lines(places, lot, s, t, RAYS_PER_LINE, on_top), None
+            lamps, found = self._gatherer.lines(places, lot, s, t, RAYS_PER_LINE, on_top)
         else:
             direction = cosine_direction(places.normal, s, t)
-            room, lamps = self._gatherer.rays(places, direction, sample, seed, RAYS_PER_LINE, on_top)
-            lamps, room = lamps / RAYS_PER_LINE, room / RAYS_PER_LINE
-            indirect.add(room, row, on_top)
+            found, lamps = self._gatherer.rays(places, direction, sample, seed, RAYS_PER_LINE, on_top)
+            lamps, found = lamps / RAYS_PER_LINE, found / RAYS_PER_LINE
+        other.add(found, row, on_top)
         direct.add(lamps, row, on_top)
-        found = on_top & (dr.max(lamps if room is None else lamps + room) > 0)
+        lit = on_top & (dr.max(lamps + found) > 0)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
-        self._landings.offer(slot, u, v, sample ^ (0 if line else 0x80000000), found & (slot != NONE))
+        self._landings.offer(slot, u, v, sample ^ (0 if line else 0x80000000), lit & (slot != NONE))
 
 
 def _share_out(weight, total):

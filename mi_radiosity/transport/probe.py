@@ -48,7 +48,7 @@ def probe(
         lot = mi.radical_inverse_2(line, dr.gather(mi.UInt32, scramble, of))
         a, b, s, t = kronecker(line, key, stream, of)
         number = k + opaque_index(first * samples)
-        H = gatherer.lines(places, lot, a, b, 1.0)
+        H, _ = gatherer.lines(places, lot, a, b, 1.0)
         for met in gatherer.rays(places, cosine_direction(normal, s, t), number, stream, 1.0):
             H += met
         runs = np.array([dr.block_sum(c, run) for c in H], dtype=np.float64).reshape(3, -1, RUNS) / run
