@@ -259,7 +259,7 @@ def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[st
     from .solver import Solution, solve
 
     solution = Solution.load(arguments.load, scene) if arguments.load else solve(scene, **options, progress=report)
-    for warning in solution.model.warnings:
+    for warning in [*solution.model.warnings, *solution.stats.get("warnings", [])]:
         print(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
     return solution
 

@@ -44,7 +44,10 @@ def test_all_rays_are_counted(solution):
 
 
 def test_too_few_rays_to_gather_are_all_shot(box):
-    assert mr.solve(box, elements=2000, rays=4000).stats["gather_rays"] == 0
+    """... and the user is told how many would do."""
+    stats = mr.solve(box, elements=2000, rays=4000).stats
+    assert stats["gather_rays"] == 0 and f"give {30 * stats['elements']:,} or more" in stats["warnings"][0]
+    assert mr.solve(box, elements=2000, rays=100_000).stats["warnings"] == []
 
 
 def test_gathering_is_better_than_shooting(box, reference):

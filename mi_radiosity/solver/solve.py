@@ -20,6 +20,7 @@ from .refine import Refinement
 from .solution import Solution
 
 ELEMENTS = 19_000  # default mesh: so many leaves more than patches
+FEW_RAYS = 30  # per element, below which a user is warned
 RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 
 
@@ -51,7 +52,8 @@ def solve(
     lamps' power. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
     it is not known).
 
-    Returns a Solution. Raises RadiosityError for options and scenes that cannot be used.
+    Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements. Raises RadiosityError for
+    options and scenes that cannot be used.
     """
     oracle, transport = oracle or GMI(0.5), transport or Shooting()
     _check(oracle, elements, epsilon, rays, lines)
@@ -122,6 +124,7 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
+        "warnings": _warnings(tree.leaf_count, rays),
     } | ({"lamps": list(kept.names)} if layers else {})
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
@@ -139,6 +142,14 @@ def _check(oracle, elements, epsilon, rays, lines):
             raise RadiosityError(f"{name} must be a whole number greater than 0, not {value}")
     if epsilon is not None and not 0 < epsilon < float("inf"):
         raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
+
+
+def _warnings(elements, rays):
+    """What a user should know of the budget (list of str)."""
+    enough = FEW_RAYS * elements
+    if rays >= enough:
+        return []
+    return [f"{rays:,} rays are few for {elements:,} elements, and noisy: give {enough:,} or more, or fewer elements"]
 
 
 def default_rays(elements: int) -> int:
