@@ -232,8 +232,11 @@ def test_in_a_notebook(solution):
 def test_view_command(tmp_path, capsys):
     kept, out = tmp_path / "box.npz", tmp_path / "box.html"
     render = ["render", "scenes_xml/box_furnace.xml", "-o", str(tmp_path / "box.png"), "--save", str(kept)]
-    assert main([*render, "--elements", "200", "--rays", "9000", "--spp", "1"]) == 0
+    assert main([*render, "--layers", "--elements", "200", "--rays", "9000", "--spp", "1"]) == 0
     assert main(["view", str(kept), "-o", str(out)]) == 0 and out.stat().st_size < 800_000
+    assert len(mr.Solution.load(kept, mi.load_file("scenes_xml/box_furnace.xml", optimize=False)).layers.names) == 1
+    assert out.read_text(encoding="utf-8").count('"scale":[1.0,1.0,1.0]') == 1
+    assert main(["render", *render[1:4], "--load", str(kept), "--layers"]) == 2
     for arguments, says in (
         (["-o", str(tmp_path / "x.png")], ".html"),
         (["-o", str(tmp_path / "none/x.html")], "does not exist"),
