@@ -33,7 +33,7 @@ STAGES = {
     "connect": "Connecting facets",
     "write": "Writing",
 }
-SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")
+SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed", "layers")
 
 Report = Callable[[str, int, int | None], None]
 
@@ -145,6 +145,8 @@ def _solve_arguments(group):
     add("--rays", type=_positive, metavar="N", help="rays that carry power (default: 300 per element)")
     add("--lines", type=_positive, metavar="S", help="random lines per pair (default 10)")
     add("--seed", type=int, metavar="K", help="random seed (default 0)")
+    layers = "keep the light of every lamp by itself, to dim and colour it later: see view"
+    add("--layers", action="store_true", default=None, help=layers)
 
 
 def _shading_argument(parser, default="gouraud"):

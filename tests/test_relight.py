@@ -161,6 +161,14 @@ def test_archives_keep_layers(solution, tmp_path):
     assert loaded.layers.names == solution.layers.names and loaded.stats["power"] == relit.stats["power"]
 
 
+def test_damaged_layers_are_refused(solution, tmp_path):
+    solution.save(tmp_path / "whole.npz")
+    with np.load(tmp_path / "whole.npz") as whole:
+        np.savez(tmp_path / "cut.npz", **{name: whole[name] for name in whole.files if name != "layers_direct"})
+    with pytest.raises(mr.RadiosityError, match="not a readable solution"):
+        mr.Solution.load(tmp_path / "cut.npz", solution.model.scene)
+
+
 def test_hours(solution):
     """A year's schedule in one product is as hour for hour."""
     hours = [{"one": k / 4, "two": (1, k / 4, 0)} for k in range(5)]

@@ -10,13 +10,16 @@ import zlib
 
 import mi_radiosity as mr
 from mi_radiosity.cli import main
-from mi_radiosity.export import view, write_page
+from mi_radiosity.export import lit_mesh, view, write_page
 from mi_radiosity.export.page import _packed
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import diffuse, lamp, rectangle
 from test_export import room, srgb
+
+T = mi.ScalarTransform4f
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = ["--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -81,6 +84,70 @@ def test_light_adds_up_and_exposure_counts(solution, page, tmp_path):
     np.testing.assert_allclose(both.mean(), picture, rtol=0.02)
     assert 0.5 < shots["mesh"].mean() / picture < 0.95
     assert (shot(page, tmp_path, "mode=lux").std(axis=2) > 0.02).mean() > 0.5
+
+
+@pytest.fixture(scope="module")
+def layered():
+    """A second lamp of its own, and the first one dimmed already."""
+    second = rectangle(T().translate([-0.99, 0, 0.3]).rotate([0, 1, 0], 90).scale(0.2), bsdf=diffuse(), emitter=lamp(9))
+    return mr.solve(room(second=second), elements=2500, rays=400_000, layers=True).relight({"lamp": 0.4})
+
+
+@pytest.fixture(scope="module")
+def desk(layered, tmp_path_factory):
+    file = tmp_path_factory.mktemp("desk") / "view.html"
+    write_page(layered, file)
+    return file
+
+
+@in_browser
+@pytest.mark.parametrize("scales", [{}, {"lamp": [0, 0, 0]}, {"second": [0, 0, 0]}, {"lamp": [1.5, 0.2, 0]}])
+def test_lamps_are_dimmed_in_the_page(layered, desk, tmp_path, scales):
+    """The sum of the layers in the browser is the picture of `relight`, lamps included."""
+    asked = "".join(f"&lamp={name}:{','.join(map(str, scale))}" for name, scale in scales.items())
+    picture = layered.relight({"lamp": 0.4} | scales).render(spp=64)
+    difference = srgb(shot(desk, tmp_path, asked)) - srgb(picture)
+    assert np.sqrt((difference**2).mean()) < 2 and abs(difference.mean()) < 0.3
+
+
+SLIDE = """<script>
+const told = {}, wait = setInterval(() => {
+    if (!window.viewer) return;
+    clearInterval(wait);
+    const [level, color] = document.querySelectorAll("#lamps input");
+    told.lamps = [...document.querySelectorAll("#lamps label")].map((label) => label.textContent);
+    told.before = [Number(level.value), viewer.data.lamps[0].scale, color.value];
+    const move = (input, value) => { input.value = value; input.dispatchEvent(new Event("input")); };
+    move(level, 1.5); move(color, "#ff8000");
+    told.after = viewer.data.lamps[0].scale;
+    move(level, 0); move(level, 1);
+    told.on = viewer.data.lamps[0].scale;
+    document.title = "told " + JSON.stringify(told);
+}, 20);
+</script></body>"""
+
+
+@in_browser
+def test_sliders(desk, tmp_path):
+    """A lamp's slider and colour say how it is, and change it; off and on again, it has its colour."""
+    page = tmp_path / "sliding.html"
+    page.write_text(desk.read_text(encoding="utf-8").replace("</body>", SLIDE), encoding="utf-8")
+    told = json.loads(re.search(r"<title>told (.*?)</title>", browse(page, "--dump-dom"))[1])
+    assert told["lamps"] == ["lamp × 0.4", "second × 1"]
+    assert told["before"] == [0.4, [0.4] * 3, "#ffffff"]
+    np.testing.assert_allclose(told["after"], [1.5, 1.5 * 0.2159, 0], rtol=1e-3)
+    np.testing.assert_allclose(told["on"], [1, 0.2159, 0], rtol=1e-3)
+
+
+@fast
+def test_light_by_lamp_adds_up(layered):
+    """At every vertex, lamps make the whole; elsewhere than beside walls to rounding."""
+    base = layered.relight({})
+    mesh = lit_mesh(base, by_lamp=True)
+    whole, summed = np.stack([mesh.direct, mesh.indirect], axis=1), mesh.lamps.sum(axis=1)
+    apart = np.abs(whole - summed).max(axis=(1, 2)) / whole.mean()
+    assert np.median(apart) < 1e-5 and apart.mean() < 0.01
+    assert lit_mesh(base).lamps.shape[1] == 0
 
 
 PROBE = """<script>
@@ -165,8 +232,11 @@ def test_in_a_notebook(solution):
 def test_view_command(tmp_path, capsys):
     kept, out = tmp_path / "box.npz", tmp_path / "box.html"
     render = ["render", "scenes_xml/box_furnace.xml", "-o", str(tmp_path / "box.png"), "--save", str(kept)]
-    assert main([*render, "--elements", "200", "--rays", "9000", "--spp", "1"]) == 0
+    assert main([*render, "--layers", "--elements", "200", "--rays", "9000", "--spp", "1"]) == 0
     assert main(["view", str(kept), "-o", str(out)]) == 0 and out.stat().st_size < 800_000
+    assert len(mr.Solution.load(kept, mi.load_file("scenes_xml/box_furnace.xml", optimize=False)).layers.names) == 1
+    assert out.read_text(encoding="utf-8").count('"scale":[1.0,1.0,1.0]') == 1
+    assert main(["render", *render[1:4], "--load", str(kept), "--layers"]) == 2
     for arguments, says in (
         (["-o", str(tmp_path / "x.png")], ".html"),
         (["-o", str(tmp_path / "none/x.html")], "does not exist"),

@@ -56,5 +56,6 @@ def export(
 def check_target(path: Path) -> None:
     """Raise RadiosityError if ``path`` is no file that `export` could write."""
     if path.suffix.lower() not in WRITERS:
-        raise RadiosityError(f"-o {path}: choose a name that ends in {', '.join(WRITERS)}")
+        hint = "add --lightmap SIZE, or " if path.suffix.lower() == ".exr" else ""
+        raise RadiosityError(f"-o {path}: {hint}choose a name that ends in {', '.join(WRITERS)}")
     check_writable(path)

@@ -40,6 +40,7 @@ class LitMesh:
     shape: np.ndarray  # [triangles] number of the shape among the parts of the scene, model.faces.parts
     back: np.ndarray  # [triangles] bool: the back of the shape
     above: np.ndarray  # [triangles] how many lit sides lie in the same plane below it
+    lamps: np.ndarray  # [vertices, lamps, 2, 3] direct and indirect by lamp, if asked for; else there are 0 lamps
 
     @property
     def irradiance(self) -> np.ndarray:
@@ -74,12 +75,13 @@ class LitMesh:
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
-def lit_mesh(solution: Solution) -> LitMesh:
+def lit_mesh(solution: Solution, by_lamp: bool = False) -> LitMesh:
     """The triangles of a solution, with the values of its Gouraud picture, and the opaque faces that no light reaches.
 
+    by_lamp: also the light of every lamp by itself as the scene has it, of a solution with layers.
     Mirrors and glass, as far as they have no diffuse lobe, are left out or black: nothing can be baked of them.
     """
-    mesh, dark = _lit(solution), dark_faces(solution.model)
+    mesh, dark = _lit(solution, by_lamp), dark_faces(solution.model)
     n, corners = len(dark), solution.model.faces.corners[dark].reshape(-1, 3)
     black = np.zeros((3 * n, 3))
     more = LitMesh(
@@ -94,6 +96,7 @@ def lit_mesh(solution: Solution) -> LitMesh:
         solution.model.faces.shape[dark],
         np.zeros(n, dtype=bool),
         np.zeros(n, dtype=np.int64),
+        np.zeros((3 * n, *mesh.lamps.shape[1:])),
     )
     return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
 
@@ -114,33 +117,40 @@ def dark_faces(model: Model) -> np.ndarray:
     return np.flatnonzero(~known & ~faces.degenerate & ~np.array(clear)[faces.shape])
 
 
-def _lit(solution):
+def _lit(solution, by_lamp):
     elements, model = solution.elements, solution.model
-    layers = [solution.field, Field(solution, solution.direct)]
+    lights = [solution]
+    if by_lamp:
+        every = range(len(solution.layers.names))
+        lights += [solution.relight({other: float(other == lamp) for other in every}) for lamp in every]
+    layers = [field for light in lights for field in (light.field, Field(light, light.direct))]
     vertices, leaves = layers[0].vertices, np.array(elements.leaves)
     corner = np.array(vertices.corner).reshape(3, -1).T
     pieces, of = cut(corner[leaves].astype(np.int64), sides_of(vertices, elements))
     table = np.hstack([_points(model, elements, corner, vertices.count), *(_known(f, corner[leaves]) for f in layers)])
     table, pieces, of, values, beside = beside_walls(solution, layers, table, pieces, of)
-    values[..., 3:] = np.minimum(values[..., 3:], values[..., :3])
+    values = values.reshape(*pieces.shape, -1, 2, 3)  # for all lamps and for each: in all, direct
+    values[..., 1, :] = np.minimum(values[..., 1, :], values[..., 0, :])
+    values = values.reshape(*pieces.shape, -1)
+    mean = values.mean(axis=(0, 1)) + 1e-30
 
     patch = np.array(elements.patch)[leaves[of]]
     face, back = np.array(model.patches.face)[patch], np.array(model.patches.back).astype(bool)[patch]
     shape = model.faces.shape[face]
     uv = _texture_coordinates(model, face, table[pieces, :3])
-    own = beside[:, None] & (np.abs(values - table[pieces, 3:]) > APART * (values + values.mean())).any(axis=2)
-    step = np.round(np.log(values + values.mean() / 100) / APART).astype(np.int64)
-    apart = np.where(own[..., None], step, np.iinfo(np.int64).max).reshape(-1, 6)
+    own = beside[:, None] & (np.abs(values - table[pieces, 3:]) > APART * (values + mean)).any(axis=2)
+    step = np.round(np.log(values + mean / 100) / APART).astype(np.int64)
+    apart = np.where(own[..., None], step, np.iinfo(np.int64).max).reshape(len(own) * 3, -1)
     key = [pieces.ravel(), np.repeat(2 * shape + back, 3), *apart.T, *_rounded(uv)]
     first, number = _unique(key)
-    number, values = number.reshape(-1, 3), values.reshape(-1, 6)[first]
+    number, values = number.reshape(-1, 3), values.reshape(len(own) * 3, -1, 2, 3)[first]
     turned = (back ^ model.faces.flipped[face])[:, None]
     rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(elements.emission(elements.leaves))[of]
     return LitMesh(
         vertices=table[pieces.ravel()[first], :3],
         triangles=np.where(turned, number[:, ::-1], number),
-        direct=values[:, 3:],
-        indirect=values[:, :3] - values[:, 3:],
+        direct=values[:, 0, 1],
+        indirect=values[:, 0, 0] - values[:, 0, 1],
         reflectance=_around(number, rho, len(first)),
         emission=_around(number, emission, len(first)),
         uv=uv.reshape(-1, 2)[first],
@@ -148,6 +158,7 @@ def _lit(solution):
         shape=shape,
         back=back,
         above=sides_below(model, face, back),
+        lamps=np.stack([values[:, 1:, 1], values[:, 1:, 0] - values[:, 1:, 1]], axis=2),
     )
 
 

@@ -97,6 +97,7 @@ def _csv(m, path):
     unit = m.unit.replace("²", "2")
     names = [*COLUMNS, *(f"{c} [{unit}]" for c in m.channels), *(f"error {c}" for c in m.channels)]
     table = np.column_stack([m.grid.points, m.grid.normals, m.values, m.errors])
+    table += 0.0  # no -0
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(names), comments="", encoding="utf-8")
 
 

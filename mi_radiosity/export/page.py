@@ -6,7 +6,7 @@ import json
 import os
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from string import Template
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.files import check_writable, writing
 from ..solver import Solution
+from ..solver.layers import Layers
 from ..solver.solution import LUMENS_PER_WATT, LUMINANCE
 from .cameras import cameras, up
 from .geometry import RAISE, LitMesh, lit_mesh, name_of
@@ -22,7 +23,7 @@ from .textures import png, textures
 from .tone import checked, exposure_of
 
 GRID = 2**20  # steps that the diagonal of a scene's box is quantised to
-LAYERS = ("direct", "indirect")
+KINDS = ("direct", "indirect")  # of layers
 
 Report = Callable[[str, int, int | None], None]
 
@@ -66,13 +67,17 @@ def page(solution: Solution, exposure: float | str = 1.0, progress: Report | Non
     report = progress or (lambda stage, done, total: None)
     exposure = checked(exposure)
     report("view", 0, 2)
-    mesh = lit_mesh(solution)
+    mesh = shown = lit_mesh(solution) if solution.layers is None else lit_mesh(solution.relight({}), by_lamp=True)
+    if solution.layers:
+        shown = _dimmed(mesh, solution.layers)
     report("view", 1, 2)
     assets = resources.files(__package__) / "assets"
     template, script, three = (
         (assets / name).read_text(encoding="utf-8") for name in ("view.html", "view.js", "three.min.js")
     )
-    data = json.dumps(_data(solution, mesh, exposure_of(mesh, exposure)), separators=(",", ":"))
+    lux = LUMENS_PER_WATT * shown.irradiance @ LUMINANCE
+    seen = {"exposure": exposure_of(shown, exposure), "most": _round_up(float(np.percentile(lux, 98)))}
+    data = json.dumps(_data(solution, mesh) | seen, separators=(",", ":"))
     text = Template(template).substitute(
         title="A walk through the light", data=data.replace("<", "\\u003c"), three=three, script=script
     )
@@ -80,14 +85,23 @@ def page(solution: Solution, exposure: float | str = 1.0, progress: Report | Non
     return text
 
 
-def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
+def _dimmed(mesh: LitMesh, layers: Layers) -> LitMesh:
+    """A mesh that has the light of every lamp, lit as a solution is."""
+    direct, indirect = np.einsum("lc,vlkc->kvc", layers.scales, mesh.lamps)
+    lamp = np.full(len(mesh.vertices), -1)
+    lamp[mesh.triangles] = layers.lamps.of_parts[mesh.shape][:, None]
+    emission = mesh.emission * np.vstack([layers.scales, np.ones(3)])[lamp]
+    return replace(mesh, direct=direct, indirect=indirect, emission=emission)
+
+
+def _data(solution: Solution, mesh: LitMesh) -> dict[str, Any]:
     """What view.js reads: arrays of vertices, triangles and leaves, and what there is once."""
     scene, parts, flat = solution.model.scene, solution.model.faces.parts, solution.leaves()
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     size = mesh.size
     pictures = textures(mesh, parts)
-    order, runs = _runs(mesh, parts, list(pictures))
-    light, leaf_light = (mesh.direct, mesh.indirect), _flat(solution)
+    order, runs = _runs(mesh, solution, list(pictures))
+    layers, light, leaf_light = _layers(solution, mesh)
     unit = max(float(max(x.max() for x in (*light, mesh.emission))), 1e-30) / 2**15  # so that halves suffice
     arrays = {
         "places": _packed(np.round((mesh.raised(RAISE * size) - low) / (size / GRID)).clip(0).astype(np.uint32)),
@@ -102,13 +116,11 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
         arrays[f"leaf_layer{k}"] = _packed(_halves(np.vstack([of_leaves, np.zeros(3)]) / unit))
     if pictures:
         arrays["uv"] = _packed(np.round(_placed(mesh, pictures) * 65535).astype(np.uint16))
-    lux = LUMENS_PER_WATT * mesh.irradiance @ LUMINANCE
     return {
-        "exposure": exposure,
         "light": unit,
         "luminous": [LUMENS_PER_WATT * w for w in LUMINANCE],
-        "most": _round_up(float(np.percentile(lux, 98))),
-        "layers": [{"name": name, "kind": name, "scale": 1} for name in LAYERS],
+        "layers": layers,
+        "lamps": _lamps(solution),
         "parts": runs,
         "textures": [base64.b64encode(png(picture.image)).decode() for picture in pictures.values()],
         "views": _views(scene, low, high),
@@ -120,25 +132,40 @@ def _data(solution: Solution, mesh: LitMesh, exposure: float) -> dict[str, Any]:
     }
 
 
-def _runs(mesh, parts, textured):
-    """The order in which triangles are drawn, and runs of them with one name and texture."""
+def _lamps(solution):
+    """Who can be dimmed, and what their emission is multiplied by at first."""
+    layers = solution.layers
+    return [{"name": n, "scale": s} for n, s in zip(layers.names, layers.scales.tolist())] if layers else []
+
+
+def _layers(solution, mesh):
+    """What there is of every layer: its name, irradiance of the vertices [vertices, 3] and leaves [leaves, 3]."""
+    leaves = np.array(solution.elements.leaves)
+    if solution.layers is None:
+        of_leaves = [np.array(getattr(solution, kind), dtype=np.float64).reshape(3, -1).T[leaves] for kind in KINDS]
+        return [{"name": kind, "kind": kind, "lamp": None} for kind in KINDS], [mesh.direct, mesh.indirect], of_leaves
+    every = [(lamp, name, k) for lamp, name in enumerate(solution.layers.names) for k in range(len(KINDS))]
+    return (
+        [{"name": f"{name}, {KINDS[k]}", "kind": KINDS[k], "lamp": lamp} for lamp, name, k in every],
+        [mesh.lamps[:, lamp, k] for lamp, _, k in every],
+        [getattr(solution.layers, KINDS[k])[lamp].T[leaves] for lamp, _, k in every],
+    )
+
+
+def _runs(mesh, solution, textured):
+    """The order in which triangles are drawn, and runs of them with one name, lamp and texture."""
+    parts, layers = solution.model.faces.parts, solution.layers
     _, first, number = np.unique(2 * mesh.shape + mesh.back, return_index=True, return_inverse=True)
     order, counts = np.argsort(number, kind="stable"), np.bincount(number)
     runs, start = [], 0
     for at, count in zip(first.tolist(), counts.tolist()):
         shape, back = int(mesh.shape[at]), bool(mesh.back[at])
         texture = textured.index((shape, back)) if (shape, back) in textured else None
-        runs.append(
-            {"name": name_of(parts, shape), "back": back, "texture": texture, "start": 3 * start, "count": 3 * count}
-        )
+        lamp = int(layers.lamps.of_parts[shape]) if layers else -1
+        run = {"name": name_of(parts, shape), "back": back, "texture": texture, "lamp": None if lamp < 0 else lamp}
+        runs.append(run | {"start": 3 * start, "count": 3 * count})
         start += count
     return order, runs
-
-
-def _flat(solution):
-    """Irradiance of the leaves, layer by layer ([leaves, 3] each)."""
-    leaves = np.array(solution.elements.leaves)
-    return [np.array(x, dtype=np.float64).reshape(3, -1).T[leaves] for x in (solution.direct, solution.indirect)]
 
 
 def _inner(mesh):

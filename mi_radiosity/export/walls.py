@@ -27,7 +27,7 @@ def beside_walls(
     """
     elements = solution.elements
     leaves = np.array(elements.leaves)
-    walled = np.array(fields[0].walled).astype(bool)[leaves]
+    walled = np.any([np.array(field.walled).astype(bool)[leaves] for field in fields[::2]], axis=0)
     for last in [False] * ROUNDS + [True]:
         beside = walled[of]
         values = table[pieces, 3:]

@@ -49,6 +49,11 @@ class Lamps:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def of_parts(self) -> np.ndarray:
+        """The lamp that each part of the scene is, −1 for those that do not shine [parts]."""
+        return self._number[:-1]
+
     def dimmed(self, scales: np.ndarray) -> Model:
         """The model with the lamps' emission times ``scales`` [lamps, 3]; all else, and its fingerprint, as it is."""
         factor, free = np.vstack([scales, np.ones(3)]), list(zip(self._free, scales[self._on_surface :]))

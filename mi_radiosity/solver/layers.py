@@ -17,6 +17,7 @@ from ..transport.series import LEAST_RAYS
 
 Scales = Mapping[str | int, float | tuple[float, float, float]]  # of lamps, by name or number
 POWERS = ("emitted", "absorbed", "escaped", "unshot")
+ARRAYS = ("direct", "indirect", "u", "v", "power", "scales")  # that an archive keeps
 
 
 @dataclass(frozen=True)
@@ -91,14 +92,12 @@ class Layers:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What an archive keeps."""
-        names = ("direct", "indirect", "u", "v", "power", "scales")
-        return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in names}
+        return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in ARRAYS}
 
     @staticmethod
     def load(data: Mapping[str, np.ndarray], lamps: Lamps, elements: Elements) -> "Layers":
         """The layers in the arrays of an archive. Raises KeyError if some are missing."""
-        names = ("direct", "indirect", "u", "v", "power", "scales")
-        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in names})
+        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in ARRAYS})
 
 
 def solve_layers(
@@ -140,7 +139,9 @@ def _shares(lamps, rays):
     """Whole numbers of rays for the lamps that add up to ``rays``, in proportion to their power (list)."""
     spare = rays - LEAST_RAYS * len(lamps)
     if spare < 0:
-        raise RadiosityError(f"{rays} rays are too few for {len(lamps)} lamps: give at least {rays - spare}")
+        raise RadiosityError(
+            f"{rays} rays are too few for {len(lamps)} lamp{'s' * (len(lamps) > 1)}: give at least {rays - spare}"
+        )
     power = lamps.power.sum(axis=1)
     ends = np.round(np.cumsum(power) / power.sum() * spare).astype(np.int64)
     return (np.diff(ends, prepend=0) + LEAST_RAYS).tolist()

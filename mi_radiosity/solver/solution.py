@@ -27,7 +27,7 @@ from ..transport import Gatherer, ViewFactors, view_factors
 from ..transport.landings import Landings
 from ..transport.probe import probe
 from .field import Field
-from .layers import Layers, Scales
+from .layers import ARRAYS, Layers, Scales
 
 FORMAT = 3
 TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
@@ -291,7 +291,8 @@ def _read(path):
             data = {name: file[name] for name in file.files}
         if int(data["format"]) != FORMAT:
             raise RadiosityError(f"{path} was written by another version: solve the scene again")
-        for name in ("fingerprint", "sides", "landings", *TREE, *EXPOSURE, *COLORS):
+        layers = [f"layers_{name}" for name in ARRAYS] if "lamps" in data else []
+        for name in ("fingerprint", "sides", "landings", *TREE, *EXPOSURE, *COLORS, *layers):
             data[name]
         return data, json.loads(str(data["stats"]))
     except FileNotFoundError:

@@ -1,5 +1,5 @@
 // A walk through a solved scene. The data: arrays of vertices, triangles and leaves (see page.py), and layers of
-// irradiance, of which any weighted sum can be shown.
+// irradiance, of which any weighted sum is shown: direct and indirect light, of all lamps or of each.
 "use strict";
 
 const data = JSON.parse(document.getElementById("data").textContent);
@@ -54,8 +54,8 @@ async function load() {
         position: spread(places, 3, vertex),
         reflectance: spread(reflectance, 3, vertex),
         emission: spread(emission, 3, vertex),
-        smooth: smooth.map((layer) => spread(layer, 3, vertex)),
-        flat: flat.map((layer) => spread(layer, 3, leaf)),
+        smooth: { layers: smooth, of: vertex }, // of vertices, and of leaves
+        flat: { layers: flat, of: leaf },
         uv: arrays.uv ? spread(Float32Array.from(arrays.uv, (x) => x / 65535), 2, vertex) : new Float32Array(2 * corners),
         inner: new Float32Array(3 * corners), // 1 for the sides of a triangle within its leaf
     };
@@ -130,16 +130,69 @@ function pictures() {
     }));
 }
 
-/** The weights of the layers in a mode: what of the irradiance counts. */
+const WHITE = [1, 1, 1];
+/** What the emission of a lamp is multiplied by, RGB. */
+const scaleOf = (lamp) => (lamp === null ? WHITE : data.lamps[lamp].scale);
+
+/** The weights of the layers in a mode, RGB: what of the irradiance counts. */
 function weights(mode) {
-    return data.layers.map((layer) => (mode === "direct" || mode === "indirect" ? Number(layer.kind === mode) : 1) * layer.scale);
+    const counts = (layer) => Number((mode !== "direct" && mode !== "indirect") || layer.kind === mode);
+    return data.layers.map((layer) => scaleOf(layer.lamp).map((s) => s * counts(layer)));
 }
 
-function sum(layers, factors, result) {
-    result.fill(0);
+/** The weighted sum of layers, spread over the corners. */
+function sum({ layers, of }, factors, result) {
+    const total = new Float32Array(layers[0].length);
     layers.forEach((layer, k) => {
-        if (factors[k]) for (let i = 0; i < result.length; i++) result[i] += factors[k] * layer[i];
+        if (factors[k].some(Boolean)) for (let i = 0; i < total.length; i++) total[i] += factors[k][i % 3] * layer[i];
     });
+    for (let i = 0; 3 * i < result.length; i++)
+        for (let c = 0, from = 3 * of(i); c < 3; c++) result[3 * i + c] = total[from + c];
+}
+
+/** What the lamps themselves emit. */
+function shine(mesh, result) {
+    for (const { start, count, lamp } of data.parts) {
+        const scale = scaleOf(lamp);
+        for (let i = 3 * start; i < 3 * (start + count); i++) result[i] = scale[i % 3] * mesh.emission[i];
+    }
+}
+
+const linear = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+const encoded = (x) => (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
+
+/** A slider and a colour for each lamp; ``changed`` is called when one moves. */
+function desk(changed) {
+    element("lamps").hidden = !data.lamps.length;
+    const show = data.lamps.map((lamp) => {
+        const label = document.createElement("label"), said = document.createElement("output");
+        const [level, color] = ["range", "color"].map((type) => Object.assign(document.createElement("input"), { type }));
+        let tint = WHITE;
+        Object.assign(level, { min: 0, step: 0.01, ariaLabel: `${lamp.name}, brightness` });
+        Object.assign(color, { ariaLabel: `${lamp.name}, colour`, title: "what its colour is multiplied by" });
+        label.append(`${lamp.name} `, said, level, color);
+        element("lamps").append(label);
+        const show = () => {
+            const most = Math.max(...lamp.scale), byte = (c) => Math.round(255 * encoded(c)).toString(16).padStart(2, "0");
+            if (most > 0) tint = lamp.scale.map((s) => s / most); // of a lamp that is off, as it was
+            level.max = Math.max(2, most, level.max);
+            level.value = most;
+            color.value = `#${tint.map(byte).join("")}`;
+            said.textContent = `× ${Number(most.toPrecision(3))}`;
+        };
+        level.addEventListener("input", () => {
+            lamp.scale = tint.map((c) => c * level.value);
+            said.textContent = `× ${level.value}`;
+            changed();
+        });
+        color.addEventListener("input", () => {
+            tint = [1, 3, 5].map((k) => linear(parseInt(color.value.slice(k, k + 2), 16) / 255));
+            lamp.scale = tint.map((c) => c * level.value);
+            changed();
+        });
+        return show;
+    });
+    return () => show.forEach((f) => f());
 }
 
 // ---- Walking ----------------------------------------------------------------------------------------
@@ -274,12 +327,14 @@ function trace(mesh, origin, way) {
 
 const digits = (x) => (x === 0 ? "0" : x >= 1000 ? Math.round(x).toLocaleString() : x.toPrecision(3));
 
-function reading(mesh, hit, factors) {
-    const at = (values) => [0, 1, 2].map((c) => hit.weights.reduce((s, w, k) => s + w * values[3 * (hit.corner + k) + c], 0));
-    const layers = mesh.smooth.map(at), H = [0, 1, 2].map((c) => layers.reduce((s, layer, k) => s + factors[k] * layer[c], 0));
-    const rho = at(mesh.reflectance), E = at(mesh.emission), B = H.map((h, c) => E[c] + rho[c] * h);
+function reading(mesh, hit) {
+    const { layers, of } = mesh.smooth, factors = weights("shaded");
+    const at = (values, place = (i) => i) =>
+        [0, 1, 2].map((c) => hit.weights.reduce((s, w, k) => s + w * values[3 * place(hit.corner + k) + c], 0));
+    const light = layers.map((layer) => at(layer, of)), H = [0, 1, 2].map((c) => light.reduce((s, x, k) => s + factors[k][c] * x[c], 0));
+    const part = data.parts.find((p) => hit.corner >= p.start && hit.corner < p.start + p.count), scale = scaleOf(part.lamp);
+    const rho = at(mesh.reflectance), E = at(mesh.emission), B = H.map((h, c) => scale[c] * E[c] + rho[c] * h);
     const lux = H.reduce((s, h, c) => s + h * data.luminous[c], 0);
-    const part = data.parts.find((p) => hit.corner >= p.start && hit.corner < p.start + p.count);
     const three = (x) => x.map(digits).join("  ");
     const lines = [`${digits(lux)} lx`, `irradiance  ${three(H)}  W/m²`];
     if (part.texture === null) lines.push(`radiosity   ${three(B)}  W/m²`);
@@ -288,12 +343,18 @@ function reading(mesh, hit, factors) {
 
 // ---- All together -----------------------------------------------------------------------------------
 
+/** "NAME:0.5" or "NAME:1,0.8,0.6": the name of a lamp, and its scale. */
+function dimming(text) {
+    const colon = text.lastIndexOf(":"), scale = text.slice(colon + 1).split(",").map((x) => Math.max(Number(x) || 0, 0));
+    return [text.slice(0, colon), scale.length === 3 ? scale : WHITE.map(() => scale[0])];
+}
+
 async function main() {
     const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
     renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader knows what it does
     const mesh = await load(), textures = await pictures();
-    const geometry = new THREE.BufferGeometry(), light = new Float32Array(3 * mesh.corners);
-    const attributes = { position: mesh.position, light, reflectance: mesh.reflectance, emission: mesh.emission, inner: mesh.inner };
+    const geometry = new THREE.BufferGeometry(), light = new Float32Array(3 * mesh.corners), emission = light.slice();
+    const attributes = { position: mesh.position, light, reflectance: mesh.reflectance, emission, inner: mesh.inner };
     for (const [name, values] of Object.entries(attributes)) geometry.setAttribute(name, new THREE.BufferAttribute(values, 3));
     geometry.setAttribute("place", new THREE.BufferAttribute(mesh.uv, 2));
     const materials = [material(null), ...textures.map(material)];
@@ -308,7 +369,7 @@ async function main() {
     }
 
     const camera = new THREE.PerspectiveCamera(50, 1, data.size / 2000, data.size * 20);
-    let asked = false, last = 0, hit = null;
+    let asked = false, stale = true, last = 0, hit = null;
     const changed = () => {
         if (asked) return;
         asked = true;
@@ -321,6 +382,7 @@ async function main() {
         asked = false;
         const walking = walker.walk(Math.min((now - last) / 1000, 0.1));
         last = now;
+        if (stale) relight();
         renderer.render(scene, camera);
         mark();
         if (walking) changed();
@@ -333,16 +395,29 @@ async function main() {
         if (seen) element("mark").style.top = `${((1 - seen.y) / 2) * innerHeight}px`;
     }
 
+    const lit = () => {
+        stale = true;
+        changed();
+    };
+
+    /** The sum of the layers, once a picture. */
     function relight() {
-        const name = mode.value, layers = name === "flat" ? mesh.flat : mesh.smooth;
-        sum(layers, weights(name), light);
-        geometry.attributes.light.needsUpdate = true;
+        stale = false;
+        const name = mode.value;
+        sum(name === "flat" ? mesh.flat : mesh.smooth, weights(name), light);
+        shine(mesh, emission);
+        for (const changing of ["light", "emission"]) geometry.attributes[changing].needsUpdate = true;
+        read();
         uniforms.outlines.value = name === "mesh";
         uniforms.lux.value = name === "lux";
         uniforms.shines.value = Number(name !== "indirect");
         uniforms.most.value = data.most;
         element("scale").style.display = name === "lux" ? "block" : "none";
-        changed();
+    }
+
+    function read() {
+        element("reading").style.display = hit ? "block" : "none";
+        if (hit) element("reading").textContent = reading(mesh, hit);
     }
 
     function scale() {
@@ -373,11 +448,10 @@ async function main() {
         const corner = new THREE.Vector3((event.clientX / innerWidth) * 2 - 1, 1 - (event.clientY / innerHeight) * 2, 0.5);
         camera.updateMatrixWorld();
         hit = trace(mesh, camera.position, corner.unproject(camera).sub(camera.position).normalize());
-        element("reading").style.display = hit ? "block" : "none";
-        if (hit) element("reading").textContent = reading(mesh, hit, weights("shaded"));
+        read();
         changed();
     };
-    mode.addEventListener("change", relight);
+    mode.addEventListener("change", lit);
     slider.addEventListener("input", expose);
     chosen.addEventListener("change", () => walker.stand(data.views[chosen.value]));
     element("solid").addEventListener("change", (event) => {
@@ -386,7 +460,15 @@ async function main() {
     });
     addEventListener("resize", resize);
 
-    // #mode=lux&view=1&exposure=2&bare opens the page like that.
+    const show = desk(lit);
+    /** What the emission of lamps is multiplied by from now on: their names, and RGB. */
+    function dim(scales) {
+        for (const lamp of data.lamps) lamp.scale = scales[lamp.name] || lamp.scale;
+        show();
+        lit();
+    }
+
+    // #mode=lux&view=1&exposure=2&lamp=NAME:0.5&lamp=OTHER:1,0.8,0.6&bare opens the page like that.
     const asks = new URLSearchParams(location.hash.slice(1));
     if ([...mode.options].some((option) => option.value === asks.get("mode"))) mode.value = asks.get("mode");
     document.body.classList.toggle("bare", asks.has("bare"));
@@ -397,9 +479,9 @@ async function main() {
     resize();
     walker.stand(data.views[chosen.value]);
     scale();
-    relight();
+    dim(Object.fromEntries(asks.getAll("lamp").map(dimming)));
     expose();
-    window.viewer = { camera, walker, mesh, data, ready: true };
+    window.viewer = { camera, walker, mesh, data, dim, ready: true };
 }
 
 main().catch((error) => {
