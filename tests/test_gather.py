@@ -77,7 +77,7 @@ def test_pixels_that_gather_agree_with_path(solution, reference, shading):
     image = np.array(solution.render(spp=256, shading=shading))[..., :3]
     assert image.mean() == pytest.approx(reference.mean(), rel=0.005)
     field = np.array(solution.render(spp=256))[..., :3]
-    assert rmse(image, reference) < (0.6 if shading == "gather" else 1.0) * rmse(field, reference)
+    assert rmse(image, reference) < (0.7 if shading == "gather" else 1.0) * rmse(field, reference)
 
 
 def test_walls_keep_gathered_light():

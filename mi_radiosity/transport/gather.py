@@ -40,10 +40,10 @@ class Gatherer:
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
 
-    def seeing(self, reflected: "mi.Color3f") -> "Gatherer":
-        """The same for other values of ρ H."""
+    def seeing(self, reflected: "mi.Color3f", landings: Landings) -> "Gatherer":
+        """The same for other values of ρ H, and where that light is."""
         other = copy.copy(self)
-        other._reflected = reflected
+        other._reflected, other._landings = reflected, landings
         return other
 
     def lines(
@@ -121,9 +121,10 @@ class Gatherer:
         if self._landings.slots == 0:
             return H
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, met)
-        landed = self._landings.any_on(slot, met)
+        crossed = met & (slot != NONE)
+        landed = self._landings.any_on(slot, crossed)
         x = e.patches.above(dr.select(met, hit.patch, 0), hit.u, hit.v)
-        return dr.select(landed & ~self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed), 0, H)
+        return dr.select(crossed & ~self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed), 0, H)
 
     def _share_of_rays(self, places, hit, met, rays_per_line):
         """The balance heuristic's weight of rays that meet lamps, c F / (p + c F) (Float [n])."""

@@ -54,7 +54,7 @@ class Gathering:
             each = 1 if line else RAYS_PER_LINE
             if not line:  # which meet the lamps' light as lines have found it
                 reflected = e.reflectance * (pull(e, self._means(alone), exposure.open_area) + flow.indirect)
-                self._gatherer = self._gatherer.seeing(reflected)
+                self._gatherer = self._gatherer.seeing(reflected, self._landings.settled().filled_by(flow.landings))
             start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
             for first in range(0, self._count * each, AT_ONCE):
                 n = min(AT_ONCE, self._count * each - first)

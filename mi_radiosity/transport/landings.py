@@ -65,6 +65,15 @@ class Landings:
         seat = SEATS * slot + number % SEATS
         return tuple(dr.gather(mi.Float, x, seat, active) for x in (self.u, self.v))
 
+    def filled_by(self, others: "Landings") -> "Landings":
+        """These landings, and ``others`` on leaves that have none."""
+        if self.slots == 0:
+            return self
+        result = Landings(self.slots, self.u, self.v)
+        result.u, result.v = (dr.select(dr.isnan(a), b, a) for a, b in ((self.u, others.u), (self.v, others.v)))
+        dr.eval(result.u, result.v)
+        return result
+
     def any_on(self, slot: "mi.UInt32", active: "mi.Bool | bool") -> "mi.Bool":
         """Did light come down on crossed leaves of these slots, NONE for other leaves (Bool [n])?"""
         if self.slots == 0:
