@@ -92,4 +92,4 @@ def test_any_scene(parts, oracle, seed):
     np.testing.assert_allclose(area[child[inner, None] + np.arange(4)].sum(axis=1), area[inner], rtol=1e-6)
     # Where a wall stands across an element, rounding may decide which side a point of its border is on.
     gaps = gaps_between_leaves(solution)
-    assert (gaps > 1e-4).sum() <= (max(12, 0.05 * len(gaps)) if np.array(Field(solution).walled).any() else 0)
+    assert (gaps > 1e-4).sum() <= (max(12, 0.06 * len(gaps)) if np.array(Field(solution).walled).any() else 0)

@@ -48,7 +48,7 @@ class Field:
         n, leaves = len(self._elements), self._elements.leaves
         self.nodes, self._points = dr.full(mi.Color3f, dr.nan, 6 * n), dr.zeros(mi.Point3f, 6 * n)
         points = self.vertices.nodes(self.vertices.point, self._half_way)
-        for k, (color, point) in enumerate(zip(self._node_values(values), points)):
+        for k, (color, point) in enumerate(zip(self._lit_alone(self._node_values(values)), points)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
             dr.scatter(self._points, point, 6 * leaves + k)
         self._walled = dr.zeros(mi.Bool, n)
@@ -57,6 +57,19 @@ class Field:
             walled |= self._rays.blocked(points[a], points[b], ~walled)
         dr.scatter(self._walled, walled | (self._dark_nodes != 0), leaves)
         dr.eval(self.nodes, self._points, self._walled)
+
+    def _lit_alone(self, nodes):
+        """``nodes`` of leaves, the middles of straight sides borrowed from no end that is away from the leaf's light: from
+        the other one, or from the leaf itself (six Color3f [leaves])."""
+        leaves = self._elements.leaves
+        own = dr.gather(mi.Color3f, self.flat, leaves)
+        dark = [(self._dark_nodes & (1 << k)) != 0 for k in range(6)]
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            lit = ~dark[k + 3] & (dr.gather(mi.UInt32, self.vertices.middle[k], leaves) == NONE)
+            ends = dr.select(dark[a], dr.select(dark[b], own, nodes[b]), nodes[a])
+            nodes[k + 3] = dr.select(lit & (dark[a] | dark[b]), ends, nodes[k + 3])
+        return nodes
 
     @property
     def walled(self) -> "mi.Bool":
