@@ -59,8 +59,8 @@ class Field:
         dr.eval(self.nodes, self._points, self._walled)
 
     def _lit_alone(self, nodes):
-        """``nodes`` of leaves, the middles of straight sides borrowed from no end that is away from the leaf's light: from
-        the other one, or from the leaf itself (six Color3f [leaves])."""
+        """``nodes`` of leaves, the middles of straight sides borrowed from no end that is away from the leaf's light:
+        from the other one, or from the leaf itself (six Color3f [leaves])."""
         leaves = self._elements.leaves
         own = dr.gather(mi.Color3f, self.flat, leaves)
         dark = [(self._dark_nodes & (1 << k)) != 0 for k in range(6)]
