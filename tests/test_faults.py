@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 
 import mi_radiosity as mr
 from mi_radiosity.evaluation.reference import Reference, render_reference
@@ -111,7 +112,10 @@ def test_damaged_solutions_are_refused(solution, cornell, tmp_path, byte):
     file = tmp_path / "kept.npz"
     solution.save(file)
     data = bytearray(file.read_bytes())
-    data[int(byte * len(data))] ^= 0xFF
+    with zipfile.ZipFile(file) as archive:
+        array = max(archive.infolist(), key=lambda member: member.compress_size)
+    name, extra = (int.from_bytes(data[array.header_offset + k :][:2], "little") for k in (26, 28))
+    data[array.header_offset + 30 + name + extra + int(byte * array.compress_size)] ^= 0xFF
     file.write_bytes(data)
     with pytest.raises(mr.RadiosityError, match="not a readable solution"):
         mr.Solution.load(file, cornell)
