@@ -8,8 +8,6 @@ import pytest
 from conftest import diffuse, lamp, leaf_corners, rectangle, scene, wall_means
 from scipy.spatial import cKDTree
 
-pytestmark = pytest.mark.fast
-
 T = mi.ScalarTransform4f
 
 
