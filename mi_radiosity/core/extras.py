@@ -11,5 +11,5 @@ def optional(module: str, what: str, extra: str) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ImportError:
-        needed = module.partition(".")[0]
+        needed = module.partition(".")[0].replace("_", "-")
         raise RadiosityError(f"{what} needs {needed}: pip install 'mi_radiosity[{extra}]'") from None

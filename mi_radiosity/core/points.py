@@ -57,6 +57,14 @@ def kronecker(
     return tuple(mi.Float((shift + index * mi.UInt32(step)) >> 8) * 2.0**-24 for shift, step in zip(shifts, STEPS))
 
 
+def lamp_lot(index: "mi.UInt32", key: "mi.UInt32", seed: "mi.UInt32", owner: "mi.UInt32") -> "mi.Float":
+    """What draws the lamp of line ``index`` of key[owner] (Float [n]): a sequence beside `kronecker`'s, of van der
+    Corput's numbers, any run of which is spread over the lamps."""
+    scramble = hash_pair(key ^ 0xA511E9B3, seed)
+    dr.eval(scramble)  # hash once per key, not once per point
+    return mi.radical_inverse_2(index, dr.gather(mi.UInt32, scramble, owner))
+
+
 def hash_pair(a: "mi.UInt32", b: "mi.UInt32") -> "mi.UInt32":
     """One well mixed number from two (UInt32 [n])."""
     return mi.sample_tea_32(a, b, ROUNDS)[0]

@@ -1,21 +1,20 @@
 """Pictures of few samples without their noise, by Open Image Denoise."""
 
 from collections.abc import Callable
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.errors import RadiosityError
-from .pixels import AT_ONCE, PixelPoints
+from ..core.extras import optional
+from .pixels import passes
 
 
-def require_denoiser() -> None:
-    """Raise RadiosityError if the library is missing."""
-    try:
-        import mitsuba_oidn  # noqa: F401
-    except ImportError:
-        raise RadiosityError("denoising needs mitsuba-oidn: pip install 'mi_radiosity[denoise]'") from None
+def require_denoiser() -> Any:
+    """The library. Raises RadiosityError if it is missing."""
+    return optional("mitsuba_oidn", "denoising", "denoise")
 
 
 def denoised_picture(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable) -> "mi.TensorXf":
@@ -24,23 +23,19 @@ def denoised_picture(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int
     Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals
     of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel.
     """
-    import mitsuba_oidn
-
-    require_denoiser()
+    denoiser = require_denoiser()
     width, height = (int(n) for n in sensor.film().crop_size())
     if sensor.film().sample_border():
         raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
-    sums, first = np.zeros((3, height * width, 3)), 0
-    while first < spp:
-        count = min(max(1, AT_ONCE // (width * height)), spp - first)
-        sums += _sums(scene, sensor, PixelPoints(width * height, first, count, spp, seed), count, sample)
-        first += count
+    sums = np.zeros((3, height * width, 3))
+    for points in passes(width * height, spp, seed):
+        sums += _sums(scene, sensor, points, sample)
     color, albedo, normal = (np.ascontiguousarray(s.reshape(height, width, 3) / spp, np.float32) for s in sums)
-    clean = mitsuba_oidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True, clean_aux=True)
+    clean = denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True, clean_aux=True)
     return mi.TensorXf(_filtered(np.asarray(clean), sensor.film().rfilter()))
 
 
-def _sums(scene, sensor, points, count, sample):
+def _sums(scene, sensor, points, sample):
     """Sums over samples of radiance, albedo and normal [3, pixels, 3]."""
     from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
 
@@ -51,7 +46,9 @@ def _sums(scene, sensor, points, count, sample):
     albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
     albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
     planes = mi.Color3f(radiance * weight), mi.Color3f(albedo), dr.select(valid, normal, 0)
-    return np.array([[dr.block_sum(c, count) for c in plane] for plane in planes], dtype=np.float64).swapaxes(1, 2)
+    return np.array(
+        [[dr.block_sum(c, points.sample_count()) for c in plane] for plane in planes], dtype=np.float64
+    ).swapaxes(1, 2)
 
 
 def _filtered(image, rfilter):

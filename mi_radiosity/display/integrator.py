@@ -76,14 +76,14 @@ def _integrator_class():
                 sensor = scene.sensors()[sensor]
             if denoise:
                 self.prepare(scene)
-                return denoised_picture(scene, sensor, spp, seed, self.sample)
+                return denoised_picture(scene, sensor, spp, seed, self._sample)
             return self.render(scene, sensor, seed=seed, spp=spp)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             seed = int(seed[0] if dr.is_array_v(seed) else seed)
-            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self.sample, develop)
+            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self._sample, develop)
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)
@@ -92,7 +92,12 @@ def _integrator_class():
             raise RadiosityError(NO_GRADIENTS)
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
-            solution = self.prepare(scene)
+            self.prepare(scene)
+            return self._sample(scene, sampler, ray, active)
+
+        def _sample(self, scene, sampler, ray, active=True):
+            """What `sample` gives of a scene that is prepared."""
+            solution = self.solution
             model, rays = solution.model, solution.model.rays
             if rays.lobes is None:
                 prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)

@@ -1,6 +1,6 @@
 """Camera samples: well spread over pixels, lenses, lamps and directions, and unbiased."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +46,13 @@ class PixelPoints:
         return mi.Point2f(mi.radical_inverse_2(index, x), mi.sobol_2(index, y))
 
 
+def passes(pixels: int, spp: int, seed: int) -> Iterator[PixelPoints]:
+    """``spp`` samples of each of so many pixels, in launches of AT_ONCE samples."""
+    most = max(1, AT_ONCE // pixels)
+    for first in range(0, spp, most):
+        yield PixelPoints(pixels, first, min(most, spp - first), spp, seed)
+
+
 def picture(
     scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable, develop: bool = True
 ) -> "mi.TensorXf | None":
@@ -55,18 +62,13 @@ def picture(
     film = sensor.film()
     film.prepare([])
     size = film.crop_size() + (2 * film.rfilter().border_size() if film.sample_border() else 0)
-    pixels, first = int(dr.prod(size)), 0
-    most = max(1, AT_ONCE // pixels)
-    while first < spp:
-        count = min(most, spp - first)
-        sampler = PixelPoints(pixels, first, count, spp, seed)
+    for sampler in passes(int(dr.prod(size)), spp, seed):
         ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
         radiance, valid, _ = sample(scene, sampler, ray)
         block = film.create_block()
-        block.set_coalesce(block.coalesce() and count >= 4)
+        block.set_coalesce(block.coalesce() and sampler.sample_count() >= 4)
         alpha = dr.select(valid, mi.Float(1), mi.Float(0))
         ADIntegrator._splat_to_block(block, film, position, radiance * weight, 1.0, alpha, [], ray.wavelengths)
         film.put_block(block)
         dr.eval(block.tensor())
-        first += count
     return film.develop() if develop else None

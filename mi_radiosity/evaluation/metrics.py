@@ -6,8 +6,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..solver import LUMINANCE
+
 EQUAL = (1 / 3, 1 / 3, 1 / 3)
-PERCEPTUAL = (0.2126, 0.7152, 0.0722)  # Rec. 709 luminance, as in sRGB
+PERCEPTUAL = LUMINANCE
 LAGS = 3  # pixels over which a reconstruction filter correlates noise
 
 

@@ -119,15 +119,21 @@ class Rays:
         vj: "mi.Float",
         active: "mi.Bool | bool" = True,
     ) -> "mi.Float":
-        """F(x, y) between any points x, relative to the origin, with their normals, and points of patches (Float [n]).
-
-        Evaluated as unnormalised cosines over r⁴.
-        """
+        """F(x, y) between any points x, relative to the origin, with their normals, and points of patches
+        (Float [n])."""
         p = self.patches
         n_j, y = dr.gather(mi.Vector3f, p.normal, j), p.point(j, uj, vj)
-        d = y - x
-        r2 = dr.squared_norm(d)
-        cosines = dr.maximum(dr.dot(normal, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
-        faces = (cosines > 0) & (r2 > 0) & active & self.on_top(j, uj, vj)
+        kernel = kernel_in_full_view(x, normal, y, n_j)
+        faces = (kernel > 0) & active & self.on_top(j, uj, vj)
         seen = faces & ~self.blocked(x + normal * p.lift, y + n_j * p.lift, faces)
-        return dr.select(seen, (cosines / r2) / r2 * dr.inv_pi, 0)
+        return dr.select(seen, kernel, 0)
+
+
+def kernel_in_full_view(
+    x: "mi.Point3f", normal_x: "mi.Vector3f", y: "mi.Point3f", normal_y: "mi.Vector3f"
+) -> "mi.Float":
+    """cos θ_x cos θ_y / (π r²) between points with their normals, as unnormalised cosines over r⁴, 1/m² (Float [n])."""
+    d = y - x
+    r2 = dr.squared_norm(d)
+    cosines = dr.maximum(dr.dot(normal_x, d), 0) * dr.maximum(-dr.dot(normal_y, d), 0)
+    return dr.select(r2 > 0, (cosines / r2) / r2 * dr.inv_pi, 0)

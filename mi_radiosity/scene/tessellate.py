@@ -75,7 +75,7 @@ def parts(scene: "mi.Scene") -> list[Part]:
         # Mitsuba's Python side tells an instance's group only where it prints it.
         name = re.search(r'name = "(.*)"', str(shape))
         members = children(groups[name[1]]) if name and name[1] in groups else []
-        matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        matrix = transform_of(shape)
         for k, member in enumerate(m for m in members if isinstance(m, mi.Shape)):
             found.append(
                 Part(member, number, f"{label(member, k)} of {part.name.replace('shape', 'instance')}", matrix)
@@ -83,6 +83,11 @@ def parts(scene: "mi.Scene") -> list[Part]:
         if not members:
             found.append(part)
     return found
+
+
+def transform_of(shape: "mi.Shape") -> np.ndarray:
+    """The transform of a shape (float64 [4, 4])."""
+    return np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
 
 def children(thing: "mi.Object") -> list:
@@ -208,7 +213,7 @@ def segments(share: float) -> int:
 def _standing(shape, vertices, faces, uv, normals=None):
     """A mesh of a shape whose vertices [n, 3] and normals are given before ``to_world``; faces are turned so that they
     look where the normals do, for flat shapes along z."""
-    matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    matrix = transform_of(shape)
     up = normals if normals is not None else np.array([[0.0, 0.0, 1.0]])
     up = _unit(up @ np.linalg.inv(matrix[:3, :3]))
     vertices, flipped = vertices @ matrix[:3, :3].T + matrix[:3, 3], shape.has_flipped_normals()
@@ -251,7 +256,7 @@ def disk_mesh(disk: "mi.Shape", share: float) -> "mi.Mesh":
 @mesher("Cylinder")
 def cylinder_mesh(cylinder: "mi.Shape", share: float) -> "mi.Mesh":
     """A prism with exactly the area of ``cylinder`` (if it is round), and the cylinder's normals."""
-    matrix = np.array(mi.traverse(cylinder)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    matrix = transform_of(cylinder)
     n, (radius, _, length) = segments(share), np.linalg.norm(matrix[:3, :3], axis=0)
     rows = int(np.clip(np.ceil(length * n / (2 * np.pi * radius) / 4), 1, 16))  # triangles at most four times as long
     i, j = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(rows)))

@@ -11,7 +11,6 @@ from ..mesh.subdivision import HALF_SIDES, child_at, child_corner, child_point
 from ..mesh.vertices import Vertices
 
 FAINT = 1e-4  # weight below which a node has no say
-SHARPEN = 1  # rounds in which vertices make up for what averaging took from the elements
 
 
 class Field:
@@ -25,8 +24,8 @@ class Field:
     of; and where there is none, by the leaf's own value if light came down in sight of the point itself.
 
     irradiance: of the elements (Color3f [elements]), by default all of the solution's.
-    vertices: the Vertices of the mesh, with values (Color3f [vertices]). nodes: six Color3f per element,
-    [6 · elements]. NaN for those that nothing is known of.
+    walled: which leaves a wall stands on (Bool [elements]). vertices: the Vertices of the mesh, with values
+    (Color3f [vertices]). nodes: six Color3f per element, [6 · elements]. NaN for those that nothing is known of.
     """
 
     def __init__(self, solution: Any, irradiance: "mi.Color3f | None" = None) -> None:
@@ -34,14 +33,12 @@ class Field:
         self._rays, self._exposure = solution.model.rays, solution.exposure
         self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
         leaves = self._elements.leaves
-        H = dr.gather(mi.Color3f, self.flat, leaves)
+        H = self.of_leaves
         self.vertices = Vertices(solution.model, self._elements)
         self._dark_nodes = self._nodes_away_from_light(leaves, dr.max(H) > 0) | self._nodes_behind_walls(leaves)
         values = self._spread(H)
-        for _ in range(SHARPEN):
-            lost = dr.select(self._dark_nodes == 0, H - self._mean(values), 0)
-            values = dr.maximum(values + self._spread(lost), 0)
-        self.values = self._straightened(values)
+        lost = dr.select(self._dark_nodes == 0, H - self._mean(values), 0)  # by averaging
+        self.values = self._straightened(dr.maximum(values + self._spread(lost), 0))
         self._store(self.values)
 
     def _store(self, values):
@@ -51,18 +48,18 @@ class Field:
         for k, (color, point) in enumerate(zip(self._lit_alone(self._node_values(values)), points)):
             dr.scatter(self.nodes, color, 6 * leaves + k)
             dr.scatter(self._points, point, 6 * leaves + k)
-        self._walled = dr.zeros(mi.Bool, n)
+        self.walled = dr.zeros(mi.Bool, n)
         walled = dr.full(mi.Bool, False, dr.width(leaves))
         for a, b in HALF_SIDES:  # both leaves of a side find the same
             walled |= self._rays.blocked(points[a], points[b], ~walled)
-        dr.scatter(self._walled, walled | (self._dark_nodes != 0), leaves)
-        dr.eval(self.nodes, self._points, self._walled)
+        dr.scatter(self.walled, walled | (self._dark_nodes != 0), leaves)
+        dr.eval(self.nodes, self._points, self.walled)
 
     def _lit_alone(self, nodes):
         """``nodes`` of leaves, the middles of straight sides borrowed from no end that is away from the leaf's light:
         from the other one, or from the leaf itself (six Color3f [leaves])."""
         leaves = self._elements.leaves
-        own = dr.gather(mi.Color3f, self.flat, leaves)
+        own = self.of_leaves
         dark = [(self._dark_nodes & (1 << k)) != 0 for k in range(6)]
         for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
@@ -70,11 +67,6 @@ class Field:
             ends = dr.select(dark[a], dr.select(dark[b], own, nodes[b]), nodes[a])
             nodes[k + 3] = dr.select(lit & (dark[a] | dark[b]), ends, nodes[k + 3])
         return nodes
-
-    @property
-    def walled(self) -> "mi.Bool":
-        """Which leaves does a wall stand on (Bool [elements])?"""
-        return self._walled
 
     @property
     def of_leaves(self) -> "mi.Color3f":
@@ -89,7 +81,7 @@ class Field:
         a, b = e.own_point(leaf, u, v, active)
         quarter = child_at(a, b)
         a, b = child_point(quarter, a, b)
-        walled = active & dr.gather(mi.Bool, self._walled, leaf, active)
+        walled = active & dr.gather(mi.Bool, self.walled, leaf, active)
         x = e.patches.above(dr.gather(mi.UInt32, e.patch, leaf, active), u, v)
         total, seen, weights, unknown = mi.Color3f(0), mi.Color3f(0), mi.Float(0), mi.Float(0)
         for corner, weight in enumerate((1 - a - b, a, b)):

@@ -30,10 +30,10 @@ class Batch:
     starts: "mi.Bool"  # False for rays that start under another face
 
 
-def launches(count: int) -> "Iterator[mi.UInt32]":
-    """Numbers of ``count`` rays, AT_ONCE at a time (UInt32 each)."""
-    for first in range(0, count, AT_ONCE):
-        yield opaque_index(first) + dr.arange(mi.UInt32, min(AT_ONCE, count - first))
+def launches(count: int, at_once: int = AT_ONCE) -> "Iterator[mi.UInt32]":
+    """Numbers of ``count`` rays, so many at a time (UInt32 each)."""
+    for first in range(0, count, at_once):
+        yield opaque_index(first) + dr.arange(mi.UInt32, min(at_once, count - first))
 
 
 def numbered_through(ray: "mi.UInt32", at: "_At", leaves: "LeafEmitter") -> "tuple[mi.Float, ...]":

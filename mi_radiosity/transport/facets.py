@@ -17,6 +17,7 @@ from ..mesh.exposure import is_covered
 from ..mesh.subdivision import NODES
 from ..scene import Model
 from ..scene.rays import Hit
+from .emit import launches
 
 LEVELS = ("shape", "face", "leaf")
 OUTSIDE = ("sky", "ground", "backs")  # where rays end that meet no facet
@@ -157,13 +158,14 @@ def _casts(facets, cast, seed, up, progress):
     last, first = owned(mi.UInt32, ends), owned(mi.UInt32, ends - cast)
     keys, stream = facets.elements.key(facets.cells), opaque_index(stream_seed(seed, Stream.FACTORS))
     up = mi.Vector3f(*(dr.opaque(mi.Float, x) for x in up))
-    for start in range(0, total, AT_ONCE):
-        ray = opaque_index(start) + dr.arange(mi.UInt32, min(AT_ONCE, total - start))
+    done = 0
+    for ray in launches(total, AT_ONCE):
         cell = lower_bound(last, ray + 1)
         met = _ends(facets, cell, kronecker(ray - dr.gather(mi.UInt32, first, cell), keys, stream, cell), up)
         dr.eval(cell, met)
         yield (np.array(cell).astype(np.uint64) << np.uint64(32)) | np.array(met)
-        progress(start + dr.width(ray), total)
+        done += dr.width(ray)
+        progress(done, total)
 
 
 def _ends(facets, cell, numbers, up):

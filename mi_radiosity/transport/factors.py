@@ -16,6 +16,7 @@ from ..core.extras import optional
 from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
 from ..mesh import Elements, Tree
 from ..scene import Model
+from ..scene.rays import kernel_in_full_view
 from .contour import exchange_area
 from .facets import AT_ONCE, OUTSIDE, Counts, Facets, count_rays
 
@@ -225,18 +226,10 @@ class _Exchange:
         i, j = dr.gather(mi.UInt32, i, of), dr.gather(mi.UInt32, j, of)
         x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
         i, j = dr.gather(mi.UInt32, e.patch, i), dr.gather(mi.UInt32, e.patch, j)
-        k = _unblocked_kernel(p, i, x, j, y) * dr.gather(mi.Float, unit, of)
+        n_i, n_j = (dr.gather(mi.Vector3f, p.normal, k) for k in (i, j))
+        k = kernel_in_full_view(p.point(i, *x), n_i, p.point(j, *y), n_j) * dr.gather(mi.Float, unit, of)
         seen = dr.select(rays.kernel(i, *x, j, *y) > 0, k, 0)
         return k, k * k, seen, seen * seen
-
-
-def _unblocked_kernel(patches, i, x, j, y):
-    """cos θ_x cos θ_y / (π r²) between points of patches, 1/m² (Float [n])."""
-    d = patches.point(j, *y) - patches.point(i, *x)
-    n_i, n_j = (dr.gather(mi.Vector3f, patches.normal, k) for k in (i, j))
-    r2 = dr.squared_norm(d)
-    cosines = dr.maximum(dr.dot(n_i, d), 0) * dr.maximum(-dr.dot(n_j, d), 0)
-    return dr.select(r2 > 0, (cosines / r2) / r2 * dr.inv_pi, 0)
 
 
 # ---- From exchange areas to a matrix -----------------------------------------------------------------

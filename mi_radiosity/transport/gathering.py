@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NONE, ColorSums, lower_bound, opaque_index, owned, totals
-from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed, triangle
+from ..core.points import Stream, cosine_direction, kronecker, lamp_lot, stream_seed, triangle
 from ..mesh.hierarchy import pull
-from .emit import AT_ONCE
+from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
 from .problem import Flow, Problem
@@ -56,11 +56,9 @@ class Gathering:
                 reflected = e.reflectance * (pull(e, self._means(alone), exposure.open_area) + flow.indirect)
                 self._gatherer = self._gatherer.seeing(reflected, self._landings.settled().filled_by(flow.landings))
             start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
-            for first in range(0, self._count * each, AT_ONCE):
-                n = min(AT_ONCE, self._count * each - first)
-                sample = opaque_index(first) + dr.arange(mi.UInt32, n)
+            for sample in launches(self._count * each):
                 self._sample(sample, start, line, direct, alone if line else indirect)
-                done += n
+                done += dr.width(sample)
                 progress(done)
         fields = {}
         for name, sums in (("direct", direct), ("indirect", indirect)):
@@ -91,8 +89,9 @@ class Gathering:
 
     def _bound(self, flow):
         """More than the samples of all leaves can add up to."""
-        emission = dr.max(dr.max(self._problem.model.patches.emission, axis=None))[0]
-        most = emission + dr.max(dr.max(flow.direct + flow.indirect, axis=None))[0]
+        most = sum(
+            dr.max(light, axis=None)[0] for light in (self._problem.model.patches.emission, flow.direct + flow.indirect)
+        )
         return 1e3 * most * self._count
 
     def _sample(self, sample, start, line, direct, other):
@@ -111,7 +110,7 @@ class Gathering:
         on_top = rays.on_top(patch, u, v)
         places = Places(patches.point(patch, u, v), dr.gather(mi.Vector3f, patches.normal, patch), leaf)
         if line:
-            lot = mi.radical_inverse_2(number, hash_pair(dr.gather(mi.UInt32, keys, row) ^ 0xA511E9B3, seed))
+            lot = lamp_lot(number, keys, seed, row)
             lamps, found = self._gatherer.lines(places, lot, s, t, RAYS_PER_LINE, on_top)
         else:
             direction = cosine_direction(places.normal, s, t)

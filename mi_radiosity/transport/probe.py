@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import opaque_index, owned_vectors
-from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed
+from ..core.points import Stream, cosine_direction, hash_pair, kronecker, lamp_lot, stream_seed
 from ..scene import Model
 from .gather import Gatherer, Places
 
@@ -42,10 +42,7 @@ def probe(
         normal = dr.gather(mi.Vector3f, owned_vectors(mi.Vector3f, normals[part]), of)
         places = Places(x, normal)
         key = hash_pair(opaque_index(first) + dr.arange(mi.UInt32, part.stop - first), 0)
-        scramble = hash_pair(key ^ 0xA511E9B3, stream)
-        dr.eval(scramble)
-        # Any run of van der Corput's numbers is spread over the lamps.
-        lot = mi.radical_inverse_2(line, dr.gather(mi.UInt32, scramble, of))
+        lot = lamp_lot(line, key, stream, of)
         a, b, s, t = kronecker(line, key, stream, of)
         number = k + opaque_index(first * samples)
         H, _ = gatherer.lines(places, lot, a, b, 1.0)
