@@ -16,13 +16,14 @@ from .export.factors import read_factors, write_factors
 from .oracles import GMI, KS, MI, KernelSamples, Oracle, Pair, Power, Uniform, information_gap
 from .scene import Light, mesher
 from .solver import Solution, solve
-from .transport import Shooting, Transport, ViewFactors, view_factors
+from .transport import Gathering, Shooting, Transport, ViewFactors, view_factors
 
 __version__ = "0.2.0"
 __all__ = [
     "GMI",
     "KS",
     "MI",
+    "Gathering",
     "KernelSamples",
     "Light",
     "Oracle",

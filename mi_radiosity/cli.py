@@ -3,39 +3,28 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .core.console import PROGRAM, Report, choose_views, positive, progress_bars, shading_argument, view_name, warn
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
-from .export.commands import add_commands as add_export_commands
-from .export.commands import recall_scene
+from .evaluation.commands import add_evaluation
+from .export.commands import add_export
 from .export.commands_factors import add_view_factors
 from .export.commands_measure import add_measure
+from .export.kept import recall_scene
 
 if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     import mitsuba as mi
 
-    from .evaluation.scenes import SceneFile
     from .scene.report import Report as SceneReport
     from .solver import Solution
     from .solver.cost import Cost
 
-PROGRAM = "mi-radiosity"
-STAGES = {
-    "refine": "Refining",
-    "distribute": "Distributing power",
-    "trace": "Tracing rays",
-    "connect": "Connecting facets",
-    "write": "Writing",
-}
 SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed", "layers")
-
-Report = Callable[[str, int, int | None], None]
 
 
 class Parser(argparse.ArgumentParser):
@@ -66,18 +55,16 @@ def _parser() -> Parser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for add, run, text in (
         (_render_arguments, _render, "solve a scene and write pictures of it"),
-        (_reference_arguments, _reference, "path-trace a reference; resumes, never starts over"),
-        (_compare_arguments, _compare, "compare oracles: error beside cost, against a path-traced reference"),
-        (_bench_arguments, _bench, "error against time: ours, path, and path with a denoiser"),
         (lambda parser: None, _info, "say what of a scene would be modelled, what not and why"),
     ):
         command = commands.add_parser(run.__name__.strip("_"), help=text)
         _scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
-    add_view_factors(commands, _scene_arguments, progress_bars)
-    add_measure(commands, _solution_arguments, progress_bars)
-    add_export_commands(commands, _loading_arguments, progress_bars)
+    add_evaluation(commands, _scene_arguments)
+    add_view_factors(commands, _scene_arguments)
+    add_measure(commands, _solution_arguments)
+    add_export(commands, _solution_arguments)
     return parser
 
 
@@ -123,8 +110,8 @@ def _render_arguments(parser):
     add("-o", "--output", required=True, type=Path, metavar="OUT.exr|.png", help=names)
     _solve_arguments(parser.add_argument_group("solution"))
     add("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
-    add("--spp", type=_positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
-    _shading_argument(parser, "gather")
+    add("--spp", type=positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
+    shading_argument(parser, "gather")
     add("--denoise", action="store_true", help="remove the noise of the samples (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
     add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
@@ -139,70 +126,15 @@ def _solve_arguments(group):
         help="ks, mi, gmi, power, uniform or a plugin's, such as gmi:0.75 (default gmi)",
     )
     add("--alpha", type=float, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
-    wanted = "leaf elements wanted (default: 19,000 more than the patches, or twice those)"
-    add("--elements", type=_positive, metavar="N", help=wanted)
+    wanted = "leaf elements wanted (default: 19,000 more than the patches)"
+    add("--elements", type=positive, metavar="N", help=wanted)
     add("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
-    add("--rays", type=_positive, metavar="N", help="rays that carry power (default: 300 per element)")
-    add("--lines", type=_positive, metavar="S", help="random lines per pair (default 10)")
+    rays = "rays in all that carry power and gather it (default: 300 for each of 19,000 elements, 20 for each of all)"
+    add("--rays", type=positive, metavar="N", help=rays)
+    add("--lines", type=positive, metavar="S", help="random lines per pair (default 10)")
     add("--seed", type=int, metavar="K", help="random seed (default 0)")
     layers = "keep the light of every lamp by itself, to dim and colour it later: see view"
     add("--layers", action="store_true", default=None, help=layers)
-
-
-def _shading_argument(parser, default="gouraud"):
-    names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"
-    parser.add_argument("--shading", default=default, metavar="NAME", help=names)
-
-
-def _reference_arguments(parser):
-    add, names = parser.add_argument, "with several views the view's number is added to the name"
-    add("-o", "--output", required=True, type=Path, metavar="REF.exr", help=names)
-    add("--spp", type=_positive, default=1024, metavar="N", help="samples per pixel in all (default 1024)")
-    add("--view", default="0", metavar="K|all")
-    add("--seed", type=int, default=0, metavar="K")
-
-
-def _budget_arguments(parser, elements, files):
-    add = parser.add_argument
-    add("-o", "--output", required=True, type=Path, metavar="DIR", help=files)
-    add("--elements", type=_positive, default=19_000, metavar="N", help=elements)
-    add("--rays", type=_positive, default=2_684_000, metavar="N")
-    add("--reference-spp", type=_positive, default=1024, metavar="N")
-    _shading_argument(parser)
-
-
-def _compare_arguments(parser):
-    add, files = parser.add_argument, "table.md, results.json, figure.png, report.html; an interrupted run goes on"
-    _budget_arguments(parser, "leaf elements of every mesh", files)
-    rows = "such as ks,gmi:1.5,mi,gmi:0.5 (default: the rows of the paper's table 1)"
-    add("--oracles", metavar="LIST", help=rows)
-    add("--lines", type=_positive, default=10, metavar="S")
-    add("--seeds", type=_positive, default=5, metavar="N", help="repetitions (default 5)")
-    add("--view", default="all", metavar="K|all")
-    samples = "camera samples per pixel of our pictures (default 64)"
-    add("--spp", type=_positive, default=64, metavar="N", help=samples)
-    equal = "which budgets are equal: mesh, rays, time; noise splits the error"
-    add("--questions", default="mesh,rays,time,noise", metavar="LIST", help=equal)
-    add("--scheduler", metavar="ADDRESS", help="run on the Dask cluster there (needs mi_radiosity[dask])")
-
-
-def _bench_arguments(parser):
-    add = parser.add_argument
-    _budget_arguments(parser, "middle of the ladder of budgets", "bench.json and error_time.png")
-    add("--view", default="0", metavar="K")
-    add("--views", type=_positive, default=16, metavar="N", help="views of the camera path (default 16)")
-    most = "most samples per pixel of path (default 1024)"
-    add("--path-spp", type=_positive, default=1024, metavar="N", help=most)
-
-
-def _positive(text):
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number greater than 0")
-    return value
 
 
 def _definition(text):
@@ -261,8 +193,7 @@ def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[st
     from .solver import Solution, solve
 
     solution = Solution.load(arguments.load, scene) if arguments.load else solve(scene, **options, progress=report)
-    for warning in [*solution.model.warnings, *solution.stats.get("warnings", [])]:
-        print(f"{PROGRAM}: warning: {warning}", file=sys.stderr)
+    warn([*solution.model.warnings, *solution.stats["warnings"]])
     return solution
 
 
@@ -273,97 +204,6 @@ def _keep(arguments: argparse.Namespace, solution: "Solution") -> None:
     if arguments.stats:
         with writing(arguments.stats) as temporary:
             Path(temporary).write_text(json.dumps(solution.stats, indent=2) + "\n")
-
-
-def _reference(arguments: argparse.Namespace) -> None:
-    from .evaluation.reference import render_reference
-
-    if arguments.output.suffix.lower() != ".exr":
-        raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .exr")
-    check_writable(arguments.output)
-    scene = arguments.file.load()
-    views = choose_views(scene, arguments.view)
-    with progress_bars() as report:
-        for view in views:
-            path, stage = view_name(arguments.output, view, views), f"path tracing view {view}"
-            result = render_reference(
-                scene,
-                scene.sensors()[view],
-                path,
-                arguments.spp,
-                arguments.seed,
-                partial(report, stage),
-            )
-            print(f"{path}: {sum(result.spp)} samples per pixel, its own RMSE_a is {result.noise():.3f}")
-
-
-def _compare(arguments: argparse.Namespace) -> None:
-    from .evaluation.compare import PAPER, compare_oracles
-
-    views = choose_views(arguments.file.load(), arguments.view)
-    with progress_bars() as report:
-        compare_oracles(
-            **_study(arguments, report),
-            oracles=arguments.oracles or PAPER,
-            lines=arguments.lines,
-            seeds=arguments.seeds,
-            views=views,
-            spp=arguments.spp,
-            questions=arguments.questions.split(","),
-            scheduler=arguments.scheduler,
-        )
-    print((arguments.output / "table.md").read_text(encoding="utf-8"))
-
-
-def _bench(arguments: argparse.Namespace) -> None:
-    from .evaluation.bench import PATH_SPP, run_bench
-    from .evaluation.plots import panel_titles
-
-    if arguments.view == "all":
-        raise RadiosityError("--view all: bench looks from one sensor, name its number")
-    (view,) = choose_views(arguments.file.load(), arguments.view)
-    with progress_bars() as report:
-        results = run_bench(
-            **_study(arguments, report),
-            view=view,
-            path_spp=[s for s in PATH_SPP if s <= arguments.path_spp],
-            views=arguments.views,
-        )
-    tracing = results["tracing"]
-    print(
-        f"solve: {tracing['warm_seconds']:.2f} s warm, {tracing['cold_seconds']:.1f} s cold, "
-        f"{tracing['solve_over_tracing']:.2f} times tracing its rays, {tracing['peak_megabytes']:.0f} MB"
-    )
-    for name, title in panel_titles(results).items():
-        for other, where in results[name]["crossing"].items():
-            print(f"{title}: {_crossing(other, where)}")
-    print(arguments.output / "bench.json")
-
-
-def _study(arguments: argparse.Namespace, report: Report) -> dict[str, Any]:
-    """What `compare_oracles` and `run_bench` are both given."""
-    file: SceneFile = arguments.file
-    return {
-        "path": arguments.scene,
-        "output": arguments.output,
-        "variant": file.variant,
-        "definitions": dict(file.definitions),
-        "plugins": file.plugins,
-        "elements": arguments.elements,
-        "rays": arguments.rays,
-        "shading": arguments.shading,
-        "reference_spp": arguments.reference_spp,
-        "progress": report,
-    }
-
-
-def _crossing(other: str, where: dict[str, Any]) -> str:
-    """Where a curve crosses ours, as a sentence."""
-    later = f"from {where['seconds']:.1f} s on" if where["seconds"] else "never in the time measured"
-    return (
-        f"RMSE_a {where['rmse_a']:.2f} takes us {where['ours_seconds']:.2f} s and {other} "
-        f"{where['other_seconds']:.2f} s; {other} is better {later}"
-    )
 
 
 def _info(arguments: argparse.Namespace) -> None:
@@ -432,40 +272,3 @@ def _prepare(arguments: argparse.Namespace) -> None:
     arguments.file.prepare()
     if "shading" in arguments:
         SHADERS.find(arguments.shading)
-
-
-def view_name(path: Path, view: int, views: Sequence[int]) -> Path:
-    """``path`` itself, or with the number of the view if there are several."""
-    return path if len(views) == 1 else path.with_name(f"{path.stem}_{view}{path.suffix}")
-
-
-def choose_views(scene: "mi.Scene", text: str) -> list[int]:
-    """Sensor numbers meant by --view."""
-    count = len(scene.sensors())
-    if count == 0:
-        raise RadiosityError("the scene has no sensor: add one to the file")
-    if text == "all":
-        return list(range(count))
-    if not text.isdigit() or int(text) >= count:
-        raise RadiosityError(
-            f"--view {text}: the scene has {count} sensor{'s' * (count > 1)}, counted from 0; choose one or 'all'"
-        )
-    return [int(text)]
-
-
-@contextmanager
-def progress_bars() -> Iterator[Report]:
-    """Yield report(stage, done, total), which draws one bar per stage on standard error."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    tasks: dict[str, Any] = {}
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
-
-        def report(stage, done, total):
-            if stage not in tasks:
-                tasks[stage] = progress.add_task(STAGES.get(stage, stage.capitalize()), total=total)
-            progress.update(tasks[stage], completed=done, total=total)
-
-        yield report

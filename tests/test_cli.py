@@ -34,7 +34,7 @@ def test_render_writes_what_it_is_asked_for(tmp_path, capsys):
         "alpha",
         "seed",
     }
-    assert set(numbers["power"]) == {"emitted", "absorbed", "escaped", "unshot"}
+    assert set(numbers["power"]) == {"emitted", "absorbed", "escaped", "unshot", "shown"}
     assert set(numbers["seconds"]) == {"scene", "refine", "distribute", "total"}
     bitmap = mi.Bitmap(str(out))
     assert json.loads(bitmap.metadata()["mi_radiosity"])["rays"] == 9000

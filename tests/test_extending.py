@@ -296,10 +296,22 @@ def test_a_transport_of_ones_own(cornell):
     noted = Noted()
     solution = mr.solve(cornell, transport=noted, **BUDGET)
     ((problem, rays, flow),) = noted.given
-    assert isinstance(flow, Flow) and rays + 0 <= 20_000 and solution.stats["rays"] == 20_000
+    assert isinstance(flow, Flow) and rays == 20_000 == solution.stats["power_rays"]
     assert problem.elements is solution.elements and problem.exposure is solution.exposure
-    usual = mr.solve(cornell, **BUDGET)
-    np.testing.assert_array_equal(np.array(solution.direct), np.array(usual.direct))
+    for shown in (solution, mr.solve(cornell, transport=mr.Shooting(), **BUDGET)):
+        np.testing.assert_array_equal(np.array(shown.direct), np.array(flow.direct))
+
+
+def test_what_ones_own_transport_finds_is_gathered_on_request(cornell):
+    """With the rays that it leaves, and as the usual one's is."""
+    noted = Noted()
+    gathered = mr.solve(cornell, transport=mr.Gathering(first=noted, share=0.5), **BUDGET)
+    ((_, rays, flow),) = noted.given
+    stats = gathered.stats
+    assert rays == stats["power_rays"] and stats["rays"] == 20_000 and 9_000 < stats["gather_rays"] <= 10_000
+    assert not np.array_equal(np.array(gathered.direct), np.array(flow.direct))
+    usual = mr.solve(cornell, transport=mr.Gathering(share=0.5), **BUDGET)
+    np.testing.assert_array_equal(np.array(gathered.direct), np.array(usual.direct))
 
 
 def test_pilot_and_transport_are_of_one_kind(cornell):

@@ -43,6 +43,53 @@ def test_all_rays_are_counted(solution):
     assert 0.7 * 400_000 < found["gather_rays"] <= 0.8 * 400_000
 
 
+def test_every_line_counts():
+    """A line to each lamp that is no surface, and one to those that are: the budget is met by what is cast."""
+    panel = rectangle(T().translate([0, 0, 0.9]).scale(0.2), bsdf=diffuse(0), emitter=lamp(), flip_normals=True)
+    points = {f"point{k}": {"type": "point", "position": [0, 0, 0.1 * k]} for k in range(3)}
+    room, cast = {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5)}, []
+
+    class Counted(mr.Gathering):
+        def __call__(self, problem, *rest, **more):
+            problem.model.rays = Counting(problem.model.rays)
+            return super().__call__(problem, *rest, **more)
+
+    class Counting:
+        def __init__(self, rays):
+            self.__dict__.update(vars(rays), _rays=rays)
+
+        def __getattr__(self, name):
+            return getattr(self._rays, name)
+
+        def follow(self, origin, *rest, **more):
+            cast.append(dr.width(origin))
+            return self._rays.follow(origin, *rest, **more)
+
+        def blocked(self, a, *rest):
+            cast.append(dr.width(a))
+            return self._rays.blocked(a, *rest)
+
+        def kernel_at(self, x, *rest):
+            cast.append(dr.width(x))
+            return self._rays.kernel_at(x, *rest)
+
+    stats = mr.solve(scene(room=room, panel=panel, **points), elements=500, rays=100_000, transport=Counted()).stats
+    assert sum(cast) == stats["rays"] == stats["power_rays"] + stats["gather_rays"]
+
+
+def test_lamps_much_weaker_than_others_shine():
+    """A lamp whose share of the rays rounds to none lights what only it can: the inside of a chest."""
+    cube = {"type": "cube", "bsdf": diffuse(0.5, two_sided=True)}
+    far, near = ({"type": "point", "position": p, "intensity": i} for p, i in (([9, 0, 0], 1e7), ([0.2, 0, 0], 1.0)))
+    hall = cube | {"to_world": T().scale(20)}
+    room = scene(hall=hall, chest=cube, far=far, near=near)
+    solution = mr.solve(room, elements=500, rays=50_000, transport=mr.Shooting())
+    leaves = solution.leaves()
+    inside = leaves.back & (np.abs(leaves.vertices).max(axis=(1, 2)) < 1.01)
+    direct = np.array(dr.gather(mi.Color3f, solution.direct, solution.elements.leaves)).T
+    assert (direct * leaves.area[:, None])[inside].sum() == pytest.approx(3 * 4 * np.pi, rel=1e-3)
+
+
 def test_too_few_rays_to_gather_are_all_shot(box):
     """... and the user is told how many would do."""
     stats = mr.solve(box, elements=2000, rays=4000).stats
@@ -54,9 +101,8 @@ def test_gathering_is_better_than_shooting(box, reference):
     """Three quarters of the error at as many rays: a leaf's own rays serve it better than those that chance upon it."""
     errors = {}
     for share in (0.8, 0.0):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("mi_radiosity.transport.gathering.SHARE", share)
-            image = np.array(mr.solve(box, elements=2000, rays=200_000).render(spp=64))[..., :3]
+        transport = mr.Gathering(share=share)
+        image = np.array(mr.solve(box, elements=2000, rays=200_000, transport=transport).render(spp=64))[..., :3]
         errors[share] = rmse(image, reference)
     assert errors[0.8] < 0.75 * errors[0.0]
 

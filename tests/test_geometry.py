@@ -90,7 +90,8 @@ def slivers():
             )
 
         direct = np.mean(2 * corner(1 - x, 1) + 2 * corner(1 + x, 1))
-        assert mean(solution, FLOOR, "direct") == pytest.approx(direct, rel=0.02)
+        # Its leaves get 16 lines and 32 rays each, and so have a noise of 4 %; this is four times that.
+        assert mean(solution, FLOOR, "direct") == pytest.approx(direct, rel=0.16)
         assert mean(solution, OTHER) > 0
 
     strip = SQUARE * [1, 1e-6, 1]

@@ -6,7 +6,7 @@ from mi_radiosity.scene import Model
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import balance
+from conftest import balance, diffuse
 
 COLOR = {"type": "rgb", "value": [0.5, 0.3, 0.2]}
 DIFFUSE = {"type": "diffuse", "reflectance": COLOR}
@@ -87,3 +87,87 @@ def test_mirrors_and_glass_make_no_patches():
 def test_diffuse_scenes_are_not_followed(cornell):
     """Not a kernel more than before: no lobe is ever asked for."""
     assert Model(cornell).rays.lobes is None
+
+
+# ---- Light that comes through lobes ----------------------------------------------------------------
+
+AREA_LAMP = {
+    "type": "sphere",
+    "radius": 0.15,
+    "bsdf": diffuse(0.0),
+    "emitter": {"type": "area", "radiance": 25.0},
+    "center": [0, 0.3, 0],
+}
+POINT_LAMP = {"type": "point", "position": [0, 0.3, 0], "intensity": 2.0}
+
+
+def closed_room(lamp, glass=True):
+    """A room of 2 × 2 × 2 m, ρ = 0.5, and a lamp in it, in a cube of glass."""
+    at = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "rfilter": {"type": "box"}}
+    look = at().look_at([0, -0.9, 0], [0, 1, 0], [0, 0, 1])
+    cover = {"type": "cube", "to_world": at().translate([0, 0.3, 0]).scale(0.3), "bsdf": {"type": "thindielectric"}}
+    parts = {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 90, "to_world": look, "film": film},
+        "room": {"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5)},
+        "lamp": lamp,
+    }
+    return mi.load_dict(parts | ({"glass": cover} if glass else {}))
+
+
+@pytest.mark.parametrize("lamp", [AREA_LAMP, POINT_LAMP], ids=["area", "point"])
+def test_light_from_behind_glass_is_shown(lamp):
+    """Nothing is lost in a closed room: what is shown is absorbed to the last watt, though no line finds the lamp."""
+    room = closed_room(lamp)
+    solution = mr.solve(room, elements=1500, rays=200_000)
+    power, leaves = solution.stats["power"], solution.leaves()
+    assert power["shown"] == pytest.approx(power["emitted"], rel=1e-3)
+    kept = np.where(leaves.shape == [s.id() for s in room.shapes()].index("room"), 0.5, 1.0)
+    assert (kept * leaves.area * leaves.irradiance.T).sum() == pytest.approx(power["emitted"], rel=1e-3)
+
+
+def test_pictures_agree_with_path_where_lamps_are_behind_glass():
+    room = closed_room(AREA_LAMP)
+    solution = mr.solve(room, elements=1500, rays=400_000)
+    path = mi.load_dict({"type": "path", "max_depth": -1})
+    true, error = mean_and_error([mi.render(room, integrator=path, spp=512, seed=seed) for seed in range(4)])
+    for shading in ("gouraud", "direct", "gather"):
+        ours, noise = mean_and_error([solution.render(spp=64, shading=shading, seed=seed) for seed in range(4)])
+        assert (np.abs(ours - true) < 4 * np.hypot(noise, error) + 0.01 * true).all(), (shading, ours, true)
+
+
+def test_light_of_points_through_glass_is_kept_and_named(tmp_path):
+    """`path` cannot find it: thin glass takes nothing away, so the room with it is as bright as without."""
+    room = closed_room(POINT_LAMP)
+    solution = mr.solve(room, elements=1500, rays=400_000)
+    assert "comes through glass" in solution.stats["warnings"][0]
+    plain = mr.solve(closed_room(POINT_LAMP, glass=False), elements=1500, rays=400_000)
+    assert plain.caustic is None and plain.stats["warnings"] == []
+    for shading in ("gouraud", "direct", "gather"):
+        ours, theirs = (np.mean(s.render(spp=64, shading=shading)) for s in (solution, plain))
+        assert ours == pytest.approx(theirs, rel=0.01)
+    at, up = [[0.3, 0.2, -1], [-0.5, 0.1, -1]], [0, 0, 1]
+    np.testing.assert_allclose(solution.irradiance(at, up), plain.irradiance(at, up), rtol=0.1)
+    solution.save(tmp_path / "kept.npz")
+    loaded = mr.Solution.load(tmp_path / "kept.npz", room)
+    np.testing.assert_array_equal(np.array(loaded.caustic), np.array(solution.caustic))
+    layers = mr.solve(room, elements=1500, rays=100_000, layers=True)
+    np.testing.assert_allclose(np.array(layers.relight({0: 2}).caustic), 2 * np.array(layers.caustic), rtol=1e-6)
+
+
+def test_a_scene_without_a_diffuse_lobe_is_refused_in_one_line():
+    for bsdf in ("dielectric", "conductor"):
+        glass = {"type": "scene", "it": {"type": "sphere", "bsdf": {"type": bsdf}}, "lamp": POINT_LAMP}
+        with pytest.raises(mr.RadiosityError, match="no surface with a diffuse lobe"):
+            mr.solve(mi.load_dict(glass))
+
+
+def test_lobes_tell_scenes_apart():
+    """A solution of rough metal is none of smooth metal."""
+    prints = []
+    for alpha in (0.1, 0.1, 0.3):
+        parts = mi.cornell_box()
+        parts["large-box"]["bsdf"] = {"type": "roughconductor", "alpha": alpha}
+        prints.append(Model(mi.load_dict(parts)).fingerprint)
+    assert prints[0] == prints[1] != prints[2]

@@ -161,6 +161,24 @@ def test_archives_keep_layers(solution, tmp_path):
     assert loaded.layers.names == solution.layers.names and loaded.stats["power"] == relit.stats["power"]
 
 
+def test_archives_of_lamps_with_other_names_are_refused(solution, tmp_path):
+    """Which of them is which could not be told."""
+    solution.save(tmp_path / "kept.npz")
+    renamed = lit_room()
+    for shape in renamed.shapes():
+        shape.set_id({"one": "two", "two": "three"}.get(shape.id(), shape.id()))
+    with pytest.raises(mr.RadiosityError, match="were called one, two, and are called three, two now|two, three now"):
+        mr.Solution.load(tmp_path / "kept.npz", renamed)
+
+
+def test_layers_have_rays_of_their_own():
+    """Two equal lamps in mirrored places would otherwise share the noise of their samples."""
+    twins = mr.solve(lit_room(1.0, 1.0), layers=True, elements=100, rays=20_000)
+    one, two = (np.array(x) for x in twins.layers.indirect)
+    flows = [(h[0] / np.average(h[0])) for h in (one, two)]
+    assert not np.allclose(*flows)
+
+
 def test_damaged_layers_are_refused(solution, tmp_path):
     solution.save(tmp_path / "whole.npz")
     with np.load(tmp_path / "whole.npz") as whole:

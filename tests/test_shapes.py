@@ -120,6 +120,19 @@ def test_instances_are_as_good_as_written_out():
     assert set(solution.leaves().shape) <= set(range(len(truth.shapes())))
 
 
+def test_edits_inside_of_groups_are_noticed():
+    """A solution of a scene is not shown of one whose instances have changed."""
+    truth = above(**group(**members()), instance=instance(PLACES[0]))
+    solution = mr.solve(truth, elements=2500, rays=100_000)
+    solution.require_unchanged()
+    (cube,) = (part.shape for part in solution.model.faces.parts if part.shape.id() == "cube")
+    params = mi.traverse(cube)
+    params["bsdf.reflectance.value"] = mi.Color3f(0.1)
+    params.update()
+    with pytest.raises(mr.RadiosityError, match="edited since it was solved"):
+        solution.render(spp=1)
+
+
 def part_of(model, name):
     """Centroids, normals and ρ of the patches of shapes with a name, in a canonical order."""
     face, shape = np.array(model.patches.face), model.faces.shape

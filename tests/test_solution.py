@@ -4,7 +4,7 @@ import copy
 
 import mi_radiosity as mr
 from mi_radiosity.core.errors import RadiosityError
-from mi_radiosity.mesh import Tree
+from mi_radiosity.mesh import Pairs, Tree
 from mi_radiosity.mesh.elements import ARRAYS
 from mi_radiosity.scene import Model
 
@@ -19,6 +19,7 @@ pytestmark = pytest.mark.fast
 T = mi.ScalarTransform4f
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 BUDGET = dict(elements=300, rays=20_000)
+FLOOR = rectangle(T().translate([0, 0, -1]).scale(2), bsdf=diffuse(0.5))
 ANY_LIGHT = dict(BUDGET, oracle=mr.Uniform())  # refines black surfaces, too
 
 
@@ -57,6 +58,19 @@ def test_later_splits_leave_a_frozen_mesh_alone(tree):
         np.testing.assert_array_equal(value, before[name])
     np.testing.assert_array_equal(np.array(tree.freeze().leaves)[: len(leaves)] >= 0, True)
     np.testing.assert_array_equal(np.array(frozen.leaves), leaves)
+
+
+def test_later_questions_leave_frozen_pairs_alone(cornell):
+    """What the oracle finds afterwards is not written into pairs that were handed out."""
+    model = Model(cornell)
+    pairs = Pairs(Tree(model.patches, model.materials, model.lights), model.rays, mr.GMI(0.5), 10, 0)
+    pairs.add_roots(mi.UInt32([0, 2, 4]), mi.UInt32([2, 4, 0]))
+    pairs.evaluate(mi.UInt32([0]))
+    frozen = pairs.freeze(pairs.elements.freeze())
+    before = np.array(frozen.sigma[0])
+    pairs.evaluate(mi.UInt32([1, 2]))
+    np.testing.assert_array_equal(np.array(frozen.sigma[0]), before)
+    assert (np.array(pairs.sigma[0]) != before).any()
 
 
 def test_a_solution_refuses_writes(cornell):
@@ -224,6 +238,34 @@ def test_irradiance_at_no_points(under_a_lamp):
 def test_refused_points(under_a_lamp, points, normals, says):
     with pytest.raises(mr.RadiosityError, match=says):
         under_a_lamp.irradiance(points, normals)
+
+
+# ---- Radiosity at points ---------------------------------------------------------------------------
+
+
+def test_radiosity_at_points_shows_textured_lamps():
+    """E of the point itself, not the mean of the patch: the lamp is dark on the left and bright on the right."""
+    halves = mi.Bitmap(np.repeat([[[0.0] * 3, [2.0] * 3]], 2, axis=0).astype(np.float32))
+    radiance = {"type": "bitmap", "bitmap": halves, "raw": True, "filter_type": "nearest"}
+    room = scene(panel=rectangle(bsdf=diffuse(0.0), emitter={"type": "area", "radiance": radiance}), floor=FLOOR)
+    solution = mr.solve(room, rays=20_000)
+    found = solution.radiosity([[-0.5, 0.2, 0], [0.5, 0.2, 0]], [0, 0, 1])
+    np.testing.assert_allclose(found, [[0] * 3, [2 * np.pi] * 3], rtol=1e-5)
+
+
+def test_radiosity_at_points_of_coated_shapes():
+    """ρ of the diffuse lobe, which is less than the reflectance under the coat: as the leaves have it."""
+    coat = {"type": "roughplastic", "diffuse_reflectance": {"type": "checkerboard"}}
+    room = scene(
+        plate=rectangle(bsdf=coat),
+        lamp=rectangle(T().translate([0, 0, 2]).rotate([1, 0, 0], 180), bsdf=diffuse(0), emitter=lamp()),
+        floor=FLOOR | {"bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
+    )
+    solution = mr.solve(room, elements=400, rays=50_000)
+    leaves = solution.leaves()
+    plate = leaves.vertices[..., 2].max(axis=1) == 0
+    at = leaves.vertices[plate].mean(axis=1)
+    np.testing.assert_allclose(solution.radiosity(at, [0, 0, 1]), leaves.radiosity[plate], rtol=0.15)
 
 
 # ---- Edited scenes ---------------------------------------------------------------------------------

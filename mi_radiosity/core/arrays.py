@@ -124,6 +124,13 @@ def totals(arrays: "Sequence[dr.ArrayBase]") -> list[float]:
     return [s[0] for s in sums]
 
 
+def apportion(total: int, weights: Sequence[float], least: int = 0) -> list[int]:
+    """Whole numbers that add up to ``total``, in proportion to weights beyond ``least`` each."""
+    least = min(least, total // len(weights))
+    ends = np.round(np.cumsum(weights) / np.sum(weights) * (total - least * len(weights))).astype(np.int64)
+    return (np.diff(ends, prepend=0) + least).tolist()
+
+
 def power_of_two(value: float) -> float:
     """The smallest power of two > ``value`` (1 for 0): scales by it round nothing."""
     return 2.0 ** (math.frexp(value)[1] if value > 0 else 0)

@@ -81,6 +81,13 @@ def triangle(u: "mi.Float", v: "mi.Float") -> "tuple[mi.Float, mi.Float]":
     return point.x, point.y
 
 
+def coordinates(x: "mi.Vector3f", e1: "mi.Vector3f", e2: "mi.Vector3f") -> "tuple[mi.Float, mi.Float]":
+    """(u, v) of x = u e₁ + v e₂ in the plane of a triangle, x taken from its corner (two Float [n])."""
+    normal = dr.cross(e1, e2)
+    n2 = dr.squared_norm(normal)
+    return dr.dot(dr.cross(x, e2), normal) / n2, dr.dot(dr.cross(e1, x), normal) / n2
+
+
 def cosine_direction(normal: "mi.Vector3f", u: "mi.Float", v: "mi.Float") -> "mi.Vector3f":
     """Cosine-distributed unit direction about ``normal`` (Vector3f [n])."""
     return mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))

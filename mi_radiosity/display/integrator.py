@@ -100,15 +100,14 @@ def _integrator_class():
             solution = self.solution
             model, rays = solution.model, solution.model.rays
             if rays.lobes is None:
-                prelim = rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-                hit = rays.locate(prelim, ray.d)
+                hit = rays.locate(rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray.d)
             else:
                 number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
-                prelim, hit = None, rays.follow(ray.o, ray.d, number, seed, camera=True, active=active)
+                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
-            reflectance = _reflectance(model, prelim, ray, hit, lit)
+            reflectance = model.reflectance_at(hit.patch, hit.u, hit.v, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
             emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, emits)
             look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
@@ -133,23 +132,6 @@ def _integrator_class():
             return f"RadiosityIntegrator[\n  shading = {self.shading}{options}\n]"
 
     return RadiosityIntegrator
-
-
-def _reflectance(model, prelim, ray, hit, lit):
-    """ρ where camera rays meet patches (Color3f [rays])."""
-    traced = model.rays.lobes is not None
-    if not model.materials.textured:
-        return dr.gather(mi.Color3f, model.patches.reflectance, hit.patch, lit)
-    if not model.rays.overlaps and not traced:
-        si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, lit)
-        return si.bsdf().eval_diffuse_reflectance(si, lit)
-    # The face shown need not be the one the ray met.
-    patch = dr.select(lit, hit.patch, 0)
-    face, back = dr.gather(mi.UInt32, model.patches.face, patch), dr.gather(mi.Bool, model.patches.back, patch)
-    value = model.materials.reflectance_at(face, hit.u, hit.v, back)
-    if not traced:
-        return value
-    return dr.select(model.materials.is_traced(face), dr.gather(mi.Color3f, model.patches.reflectance, patch), value)
 
 
 def register(*_: object) -> None:

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import owned
-from ..solver import LUMENS_PER_WATT, LUMINANCE, Solution
+from ..core.color import LUMENS_PER_WATT, LUMINANCE
+from ..solver import Solution
 from .shaders import Gouraud, Look
 
 # Viridis (CC0, by Stéfan van der Walt and Nathaniel Smith) at 17 places, sRGB in thousandths.

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.plugins import Registry
-from ..core.points import cosine_direction
+from ..core.points import coordinates, cosine_direction
 from ..scene.rays import Hit
 from ..solver import Field, Solution
 from ..transport import Places
@@ -98,13 +98,11 @@ class Mesh(Gouraud):
         p0 = dr.gather(mi.Point3f, patches.p0, patch) + patches.origin
         e1, e2 = dr.gather(mi.Vector3f, patches.e1, patch), dr.gather(mi.Vector3f, patches.e2, patch)
         normal = dr.cross(e1, e2)
-        n2 = dr.squared_norm(normal)
 
         def local(origin, direction):
             """Barycentric coordinates on the leaf where a ray meets the plane of its patch."""
             x = origin + direction * (dr.dot(p0 - origin, normal) / dr.dot(direction, normal)) - p0
-            u, v = dr.dot(dr.cross(x, e2), normal) / n2, dr.dot(dr.cross(e1, x), normal) / n2
-            a, b = elements.own_point(look.leaf, u, v, look.lit)
+            a, b = elements.own_point(look.leaf, *coordinates(x, e1, e2), look.lit)
             return mi.Vector3f(1 - a - b, a, b)
 
         here = local(ray.o, ray.d)
@@ -122,9 +120,13 @@ class Gather(Shader):
     def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
         self._gatherer = solution.gatherer()
+        # What no sample can find is shown as it was shot.
+        self._caustic = None if solution.caustic is None else Field(solution, solution.caustic)
 
     def irradiance(self, look: Look) -> "mi.Color3f":
         lamps, room = self._samples(look)
+        if self._caustic is not None:
+            room += self._caustic.at(look.leaf, look.hit.u, look.hit.v, look.lit)
         return lamps + room
 
     def _samples(self, look):

@@ -6,17 +6,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..solver import LUMINANCE
+from ..core.color import LUMINANCE, srgb
 
 EQUAL = (1 / 3, 1 / 3, 1 / 3)
 PERCEPTUAL = LUMINANCE
 LAGS = 3  # pixels over which a reconstruction filter correlates noise
-
-
-def srgb(image: ArrayLike) -> np.ndarray:
-    """Linear radiance ─► 0…255 sRGB-encoded, clipped but not rounded (float64)."""
-    x = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
-    return 255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def mean_square(difference: np.ndarray, weights: Sequence[float] = EQUAL) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from .metrics import srgb
+from ..core.color import srgb
 from .records import picture_file
 
 ROWS_OF_FIGURE = ("ks", "mi", "gmi:0.5")  # Fig. 1: KS, GMI_1, GMI_0.5

@@ -19,7 +19,7 @@ import mitsuba as mi
 from ..scene import Model
 from ..scene.rays import Rays
 from ..solver import solve
-from ..transport import Shooting
+from ..transport import Gathering
 from .scenes import SceneFile, scene_file
 
 COLD = """
@@ -169,7 +169,7 @@ def _hit(found):
     return found.prim_index, found.shape_index, found.prim_uv, found.t
 
 
-class Carrying(Shooting):
+class Carrying(Gathering):
     """The usual transport, telling a Recorder that rays carry power from now on; pilots were cast before."""
 
     def __call__(self, problem, *args, **kwargs):

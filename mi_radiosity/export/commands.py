@@ -1,24 +1,19 @@
 """mi-radiosity export and view."""
 
 import argparse
-import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..core.console import progress_bars
 from ..core.errors import RadiosityError
 from ..core.files import check_writable
 from .commands_lightmap import bake, lightmap_arguments, refuse_without_lightmap
-
-if TYPE_CHECKING:  # imported where they are used, so that --help is quick
-    from ..solver import Solution
-
-Bars = Callable[[], AbstractContextManager[Callable[[str, int, int | None], None]]]
+from .kept import load_kept
 
 
-def add_commands(commands: Any, loading_arguments: Callable[[Any], None], bars: Bars) -> None:
-    """Add the commands to a parser's; ``loading_arguments`` adds what says how a scene is loaded."""
+def add_export(commands: Any, solution_arguments: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Add the commands; ``solution_arguments`` adds those that say which solution, and how its scene is loaded."""
     for run, files, text in (
         (
             _export,
@@ -29,42 +24,12 @@ def add_commands(commands: Any, loading_arguments: Callable[[Any], None], bars: 
     ):
         parser = commands.add_parser(run.__name__.strip("_"), help=text)
         add = parser.add_argument
-        add("solution", type=Path, metavar="SOLUTION.npz", help="kept by render --save")
+        solution_arguments(parser)
         add("-o", "--output", required=True, type=Path, metavar=files)
-        add("--scene", type=Path, metavar="SCENE", help="the scene's file, if it is not where it was")
         add("--exposure", default="1", metavar="X|auto", help="what radiance is multiplied by for colours (default 1)")
         if run is _export:
             lightmap_arguments(parser)
-        loading_arguments(parser)
-        parser.set_defaults(command=run, mode=None, bars=bars)
-
-
-def recall_scene(arguments: argparse.Namespace) -> None:
-    """Complete the arguments of a command that reads a kept solution by what that says of its scene.
-
-    Raises RadiosityError if it does not say it, or if the scene is gone.
-    """
-    if "solution" not in arguments:
-        return
-    from ..solver import Solution
-
-    source = Solution.source_of(arguments.solution) or {}
-    if arguments.scene is None:
-        if not source:
-            raise RadiosityError(
-                f"{arguments.solution} does not say which scene it belongs to: name the file with --scene"
-            )
-        arguments.scene = Path(source["path"])
-        beside = arguments.solution.parent / arguments.scene.name
-        if not arguments.scene.is_file() and beside.is_file():
-            arguments.scene = beside
-        if not arguments.scene.is_file():
-            raise RadiosityError(
-                f"the scene {arguments.scene} of {arguments.solution} is gone: name the file with --scene"
-            )
-    arguments.mode = arguments.mode or source.get("variant", "llvm_ad_rgb")
-    arguments.define = [*source.get("definitions", ()), *arguments.define]
-    arguments.plugin = [*source.get("plugins", ()), *arguments.plugin]
+        parser.set_defaults(command=run)
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -73,12 +38,12 @@ def _export(arguments: argparse.Namespace) -> None:
 
     checked(arguments.exposure)
     if arguments.lightmap is not None:
-        bake(arguments, _load)
+        bake(arguments)
         return
     refuse_without_lightmap(arguments)
     check_target(arguments.output)
-    solution = _load(arguments)
-    with arguments.bars() as report:
+    solution = load_kept(arguments)
+    with progress_bars() as report:
         export(solution, arguments.output, arguments.exposure, report)
     print(arguments.output)
 
@@ -91,16 +56,7 @@ def _view(arguments: argparse.Namespace) -> None:
         raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .html")
     checked(arguments.exposure)
     check_writable(arguments.output)
-    solution = _load(arguments)
-    with arguments.bars() as report:
+    solution = load_kept(arguments)
+    with progress_bars() as report:
         write_page(solution, arguments.output, arguments.exposure, report)
     print(arguments.output)
-
-
-def _load(arguments: argparse.Namespace) -> "Solution":
-    from ..solver import Solution
-
-    solution = Solution.load(arguments.solution, arguments.file.load())
-    for warning in solution.model.warnings:
-        print(f"mi-radiosity: warning: {warning}", file=sys.stderr)
-    return solution

@@ -1,25 +1,18 @@
 """mi-radiosity view-factors."""
 
 import argparse
-import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..core.console import progress_bars, warn
 from ..core.errors import RadiosityError
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
-ProgressBars = Callable[[], AbstractContextManager]
-
-
-def add_view_factors(
-    commands: Any, scene_arguments: Callable[[argparse.ArgumentParser], None], progress_bars: ProgressBars
-) -> None:
-    """Add the command to ``commands``; ``scene_arguments`` adds those that say which scene and how it is loaded."""
+def add_view_factors(commands: Any, scene_arguments: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Add the command; ``scene_arguments`` adds those that say which scene and how it is loaded."""
     parser = commands.add_parser("view-factors", help="view factors between shapes or faces, as a sparse matrix")
     scene_arguments(parser)
     add = parser.add_argument
@@ -29,10 +22,10 @@ def add_view_factors(
     add("--rays", type=int, metavar="N", help="rays from every row (default 1,024; 131,072 from shapes)")
     add("--up", default="z", metavar="x|y|z", help="axis towards the sky (default z); -x, -y, -z as --up=-z")
     add("--seed", type=int, default=0, metavar="K", help="random seed (default 0)")
-    parser.set_defaults(command=partial(_view_factors, progress_bars=progress_bars))
+    parser.set_defaults(command=_view_factors)
 
 
-def _view_factors(arguments: argparse.Namespace, progress_bars: ProgressBars) -> None:
+def _view_factors(arguments: argparse.Namespace) -> None:
     """Compute, write, and print what closing has changed."""
     from ..scene import Model
     from ..transport import view_factors
@@ -41,8 +34,7 @@ def _view_factors(arguments: argparse.Namespace, progress_bars: ProgressBars) ->
     check_factors_path(arguments.output)
     up = _up(arguments.up)
     model = Model(arguments.file.load(), lit=False)
-    for warning in model.warnings:
-        print(f"mi-radiosity: warning: {warning}", file=sys.stderr)
+    warn(model.warnings)
     with progress_bars() as report:
         factors = view_factors(model, arguments.level, arguments.rays, seed=arguments.seed, up=up, progress=report)
         write_factors(factors, arguments.output, lambda done, total: report("write", done, total))
@@ -54,7 +46,7 @@ def _view_factors(arguments: argparse.Namespace, progress_bars: ProgressBars) ->
         f"entries changed by {c.mean:.2g} in the mean, {c.largest:.2g} at most"
     )
     if c.row_error > 1e-9:
-        print("mi-radiosity: warning: some rows do not sum to 1: more --rays may help", file=sys.stderr)
+        warn(["some rows do not sum to 1: more --rays may help"])
 
 
 def _up(text):

@@ -1,13 +1,10 @@
 """mi-radiosity export --lightmap."""
 
 import argparse
-from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from ..core.console import progress_bars
 from ..core.errors import RadiosityError
-
-if TYPE_CHECKING:  # imported where it is used, so that --help is quick
-    from ..solver import Solution
+from .kept import load_kept
 
 SAMPLES = 256  # per texel
 
@@ -30,7 +27,7 @@ def refuse_without_lightmap(arguments: argparse.Namespace) -> None:
             raise RadiosityError(f"--{name} belongs to a lightmap: add --lightmap SIZE, or leave it out")
 
 
-def bake(arguments: argparse.Namespace, load: Callable[[argparse.Namespace], "Solution"]) -> None:
+def bake(arguments: argparse.Namespace) -> None:
     """Write a lightmap, and say what it is made of."""
     from .lightmap import check_budget
     from .lightmap_files import check_target, export_lightmap
@@ -38,8 +35,8 @@ def bake(arguments: argparse.Namespace, load: Callable[[argparse.Namespace], "So
     samples = SAMPLES if arguments.samples is None else arguments.samples
     check_budget(arguments.lightmap, samples, arguments.denoise)
     check_target(arguments.output, arguments.unlit)
-    solution = load(arguments)
-    with arguments.bars() as report:
+    solution = load_kept(arguments)
+    with progress_bars() as report:
         found = export_lightmap(
             solution,
             arguments.output,

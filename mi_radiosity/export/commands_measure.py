@@ -2,24 +2,23 @@
 
 import argparse
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..core.console import progress_bars
 from ..core.errors import RadiosityError
 from ..core.files import check_writable
+from .kept import load_kept
 
 SAMPLES = 1024  # per point
-ProgressBars = Callable[[], AbstractContextManager]
 
 
-def add_measure(commands: Any, loading: Callable[[argparse.ArgumentParser], None], progress_bars: ProgressBars) -> None:
-    """Add the command to ``commands``. loading: adds the arguments that say which solution, and how its scene loads."""
+def add_measure(commands: Any, solution_arguments: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Add the command; ``solution_arguments`` adds those that say which solution, and how its scene is loaded."""
     parser = commands.add_parser("measure", help="light at points, over a plane or a shape: W/m² or lx")
-    loading(parser)
+    solution_arguments(parser)
     _arguments(parser)
-    parser.set_defaults(command=partial(_measure, progress_bars=progress_bars))
+    parser.set_defaults(command=_measure)
 
 
 def _arguments(parser):
@@ -35,9 +34,8 @@ def _arguments(parser):
     add("-o", "--output", type=Path, metavar="OUT.csv|.vtu|.png", help="numbers, a mesh, or a picture in false colours")
 
 
-def _measure(arguments: argparse.Namespace, progress_bars: ProgressBars) -> None:
+def _measure(arguments: argparse.Namespace) -> None:
     """Measure, write what was asked for, and print mean, least, most and uniformity."""
-    from ..solver import Solution
     from .grids import file_grid, plane_grid, shape_grid
     from .measure import check_output, measure, write_measurement
 
@@ -48,7 +46,7 @@ def _measure(arguments: argparse.Namespace, progress_bars: ProgressBars) -> None
         check_output(arguments.output, arguments.points is None)
     if arguments.points and arguments.spacing is not None:
         raise RadiosityError("--spacing belongs to --plane and --shape: points of a file are where they are")
-    solution = Solution.load(arguments.solution, arguments.file.load())
+    solution = load_kept(arguments)
     if arguments.points:
         grid = file_grid(arguments.points)
     elif arguments.plane:

@@ -6,7 +6,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from ..core.errors import RadiosityError
+from ..core.extras import optional
 from ..core.files import writing
 from ..scene import Model
 from .cameras import cameras, up
@@ -45,10 +45,7 @@ class GltfFile:
     """A glTF file that grows: nodes under one that turns the scene so that +y is up."""
 
     def __init__(self, scene: "mi.Scene") -> None:
-        try:
-            import pygltflib
-        except ImportError:
-            raise RadiosityError("glTF needs the library pygltflib: pip install 'mi_radiosity[export]'") from None
+        pygltflib = optional("pygltflib", "glTF", "export")
         self.lib, self._bytes = pygltflib, bytearray()
         self.gltf = pygltflib.GLTF2(
             asset=pygltflib.Asset(version="2.0", generator="mi_radiosity"),

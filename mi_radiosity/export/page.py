@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.files import check_writable, writing
 from ..solver import Solution
 from ..solver.layers import Layers
-from ..solver.solution import LUMENS_PER_WATT, LUMINANCE
 from .cameras import cameras, up
 from .geometry import RAISE, LitMesh, lit_mesh, name_of
 from .textures import png, textures

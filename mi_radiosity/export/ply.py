@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 
+from ..core.color import srgb8
 from ..core.files import writing
 from .geometry import LitMesh
-from .tone import srgb8
 
 LIGHT = ("irradiance", "radiosity")
 

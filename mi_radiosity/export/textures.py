@@ -6,9 +6,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.color import srgb8
 from ..scene.tessellate import Part
 from .geometry import LitMesh
-from .tone import srgb8
 
 FEWEST, MOST = 512, 2048  # pixels along a side
 

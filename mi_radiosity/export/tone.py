@@ -12,12 +12,6 @@ if TYPE_CHECKING:
 BRIGHT = 0.98  # share of the lit area that the exposure "auto" shows without clipping
 
 
-def srgb8(linear: np.ndarray) -> np.ndarray:
-    """Linear values as 8-bit sRGB (uint8, of the same shape)."""
-    x = np.clip(linear, 0, 1)
-    return np.round(255 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)).astype(np.uint8)
-
-
 def checked(exposure: float | str) -> float | str:
     """A number > 0, or "auto". Raises RadiosityError for anything else."""
     if exposure == "auto":

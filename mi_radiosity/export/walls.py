@@ -4,7 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import owned
+from ..core.arrays import owned, owned_vectors
+from ..core.points import coordinates
 from ..mesh.exposure import is_covered
 from ..solver import Solution
 from ..solver.field import Field
@@ -74,6 +75,4 @@ def _fit(solution, fields, table, pieces, leaf, values):
 def _patch_coordinates(patches, patch, points):
     """(u, v) on patches of points relative to their origin (two Float [n])."""
     p0, e1, e2 = (dr.gather(type(x), x, patch) for x in (patches.p0, patches.e1, patches.e2))
-    x, normal = mi.Vector3f(*(owned(mi.Float, c) for c in points.T)) - p0, dr.cross(e1, e2)
-    n2 = dr.squared_norm(normal)
-    return dr.dot(dr.cross(x, e2), normal) / n2, dr.dot(dr.cross(e1, x), normal) / n2
+    return coordinates(owned_vectors(mi.Vector3f, points) - p0, e1, e2)

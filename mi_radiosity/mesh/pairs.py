@@ -51,6 +51,7 @@ class Pairs:
         for name in ARRAYS:
             value = getattr(self, name)
             setattr(frozen, name, type(value)(value))
+        frozen.sigma = [type(s)(s) for s in self.sigma]
         return frozen
 
     def _append(self, receiver, source):

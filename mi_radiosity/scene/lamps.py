@@ -102,7 +102,7 @@ class Dimmed(Light):
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
         return self._light.density(direction)
 
-    def lights_up(self, rays: Any, *places: Any, **options: Any) -> "mi.Color3f":
+    def lights_up(self, rays: Any, *places: Any, **options: Any) -> "tuple[mi.Color3f, mi.Color3f]":
         return tuple(found * self.color for found in self._light.lights_up(rays, *places, **options))
 
     def fingerprint(self) -> bytes:

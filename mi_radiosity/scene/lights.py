@@ -13,6 +13,7 @@ from ..core.errors import RadiosityError
 from ..core.plugins import Registry
 from ..core.points import kronecker, triangle
 from .faces import Faces
+from .state import parameters
 
 LIGHTS = Registry("emitter")
 LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
@@ -44,6 +45,11 @@ class Light:
     def refusal(emitter: "mi.Emitter") -> str | None:
         """Why an emitter of this kind cannot be used, and what to do, or None."""
 
+    @property
+    def is_sky(self) -> bool:
+        """Is it what rays see that leave the scene?"""
+        return self.emitter.is_environment()
+
     @staticmethod
     def exitance(emitter: "mi.EmitterPtr", si: "mi.SurfaceInteraction3f") -> "mi.Color3f":
         """E = π L_e of emitters at points of their shapes, W/m² (EmitterPtr, SurfaceInteraction3f ─► Color3f [n])."""
@@ -67,11 +73,7 @@ class Light:
 
     def fingerprint(self) -> bytes:
         """What tells it from other lamps: all parameters of the emitter."""
-        parts = [self.emitter.class_name().encode()]
-        for name, value in sorted(mi.traverse(self.emitter)):
-            number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
-            parts += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
-        return b"".join(parts)
+        return parameters(self.emitter)
 
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
         """Density of `sample` over directions, 1/sr, if rays that leave the scene see the lamp; else 0 (Float [n])."""
@@ -173,7 +175,7 @@ class Infinite(Free):
     )
 
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
-        if not self.emitter.is_environment():
+        if not self.is_sky:
             return mi.Float(0)
         sample = dr.zeros(mi.DirectionSample3f, dr.width(direction))
         sample.d = direction
@@ -329,7 +331,7 @@ class Lights:
     @property
     def sky_light(self) -> Light | None:
         """The lamp that rays see which leave the scene, or None."""
-        return next((light for light in self.free if light.emitter.is_environment()), None)
+        return next((light for light in self.free if light.is_sky), None)
 
 
 def varies(emitter: "mi.Emitter") -> bool:

@@ -2,9 +2,11 @@
 
 import hashlib
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from .faces import Faces
 from .lights import Lights
@@ -13,7 +15,7 @@ from .overlap import find_overlaps
 from .patches import lift_of, make_patches
 from .rays import Rays
 from .reach import reached
-from .state import State
+from .state import State, parameters
 
 
 class Model:
@@ -21,7 +23,7 @@ class Model:
 
     sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
     not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many
-    sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance, emission and lamps.
+    sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance, lobes, emission and lamps.
     ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
@@ -39,9 +41,13 @@ class Model:
         self.unreached = 0
         if sides is None:
             sides = self._sides(self._candidate & ~overlaps.covered)
-            if lit:
+            if lit and len(sides):
                 found = reached(self._rays(sides, overlaps), self.lights)
                 sides, self.unreached = sides[found], int((~found).sum())
+            if not len(sides):
+                raise RadiosityError(
+                    "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
+                )
         kept, doubled = overlaps.among(self._numbers(sides))
         self.rays = self._rays(sides, kept)
         self.patches = self.rays.patches
@@ -50,6 +56,17 @@ class Model:
     def with_sides(self, sides: np.ndarray) -> "Model":
         """The same scene with other patches."""
         return self if np.array_equal(sides, self.patches.sides) else Model(self.scene, sides, self.lights.required)
+
+    def reflectance_at(
+        self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.Color3f":
+        """ρ at points of patches, with textures; the mean over the patch where other lobes are traced (Color3f [n])."""
+        mean = dr.gather(mi.Color3f, self.patches.reflectance, patch, active)
+        if not self.materials.textured:
+            return mean
+        face, back = (dr.gather(type(x), x, patch, active) for x in (self.patches.face, self.patches.back))
+        at_point = self.materials.reflectance_at(face, u, v, back)
+        return dr.select(active & ~self.materials.is_traced(face), at_point, mean)
 
     def _find_overlaps(self):
         """Faces in one another: one of them is lit and shown wherever several are."""
@@ -92,4 +109,6 @@ class Model:
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
         for light in self.lights.free:
             digest.update(light.fingerprint())
+        lobes = [parameters(part.shape.bsdf()) for part, traced in zip(f.parts, self.materials.traced) if traced]
+        digest.update(b"".join(sorted(lobes)))
         return digest.hexdigest()

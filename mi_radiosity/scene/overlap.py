@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import components, owned, owned_vectors
+from ..core.points import coordinates
 from .faces import Faces
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
@@ -74,9 +75,7 @@ class Lookup:
         while active & (at < end):
             other = dr.gather(mi.UInt32, self._over, at)
             q0, q1, q2 = (dr.gather(type(t), t, other >> 1) for t in self._triangles)
-            normal = dr.cross(q1, q2)
-            n2 = dr.squared_norm(normal)
-            a, b = dr.dot(dr.cross(x - q0, q2), normal) / n2, dr.dot(dr.cross(q1, x - q0), normal) / n2
+            a, b = coordinates(x - q0, q1, q2)
             inside = (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)
             side = dr.select(inside, other, side)
             u = dr.select(inside, dr.clip(a, 0, 1), u)

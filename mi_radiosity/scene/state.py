@@ -2,8 +2,10 @@
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.errors import RadiosityError
+from .tessellate import parts
 
 
 class State:
@@ -36,9 +38,19 @@ def refuse_gradients(scene: "mi.Scene") -> None:
                 )
 
 
+def parameters(thing: "mi.Object") -> bytes:
+    """What tells a lamp or a material from others: its class, and all of its parameters that Mitsuba shows."""
+    found = [thing.class_name().encode()]
+    for name, value in sorted(mi.traverse(thing), key=lambda parameter: parameter[0]):
+        number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
+        found += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
+    return b"".join(found)
+
+
 def _parameters(scene):
     """{(number, name): value} of everything that decides what is solved."""
-    things = [*scene.shapes(), *scene.emitters()]
+    members = {part.shape.ptr: part.shape for part in parts(scene) if part.to_world is not None}
+    things = [*scene.shapes(), *members.values(), *scene.emitters()]
     return {
         (number, f"{thing.id() or number}.{name}"): type(value)(value)  # Mitsuba's own would change with the scene
         for number, thing in enumerate(things)

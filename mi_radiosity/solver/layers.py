@@ -3,30 +3,32 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import owned, owned_vectors
+from ..core.arrays import apportion, owned, owned_vectors, totals
 from ..core.errors import RadiosityError
 from ..core.points import hash_pair
 from ..mesh import Elements
 from ..scene.lamps import Lamps
-from ..transport import Problem
+from ..transport import Flow, Problem
 from ..transport.landings import SEATS, Landings
 from ..transport.series import LEAST_RAYS
 
 Scales = Mapping[str | int, float | tuple[float, float, float]]  # of lamps, by name or number
-POWERS = ("emitted", "absorbed", "escaped", "unshot")
-ARRAYS = ("direct", "indirect", "u", "v", "power", "scales")  # that an archive keeps
+POWERS = ("emitted", "absorbed", "escaped", "unshot", "shown")  # by a transport; and absorbed of what is shown
+LIGHT = ("direct", "indirect", "caustic")  # of a Flow
+ARRAYS = ("direct", "indirect", "u", "v", "power", "scales")  # that an archive keeps, and caustic where there is some
 
 
 @dataclass(frozen=True)
 class Layers:
     """Light of every lamp as the scene has it, on one mesh.
 
-    lamps: who they are. elements: the mesh, with the emission of the scene. direct, indirect: irradiance, W/m² (float32
-    [lamps, 3, elements]). u, v: landings [lamps, seats] (see `Landings`). power: W [POWERS, lamps, 3]. scales: those
-    of the solution that these layers belong to [lamps, 3].
+    lamps: who they are. elements: the mesh, with the emission of the scene. direct, indirect, caustic: irradiance, W/m²
+    (float32 [lamps, 3, elements]). u, v: landings [lamps, seats] (see `Landings`). power: W [POWERS, lamps, 3].
+    scales: those of the solution that these layers belong to [lamps, 3].
     """
 
     lamps: Lamps
@@ -37,6 +39,7 @@ class Layers:
     v: np.ndarray
     power: np.ndarray
     scales: np.ndarray
+    caustic: np.ndarray | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -61,17 +64,17 @@ class Layers:
     def summed(self, scales: np.ndarray) -> dict:
         """What of a Solution changes with the light: Σ_l s_l H_l, exact by superposition."""
         model = self.lamps.dimmed(scales)
-        direct, indirect = (
-            owned_vectors(mi.Color3f, np.einsum("lc,lce->ec", scales, h)) for h in (self.direct, self.indirect)
-        )
+        light = {name: getattr(self, name) for name in LIGHT}
+        light = {
+            name: None if h is None else owned_vectors(mi.Color3f, np.einsum("lc,lce->ec", scales, h))
+            for name, h in light.items()
+        }
         return {
             "model": model,
             "elements": _lit(self.elements, self.lamps, model, scales),
-            "direct": direct,
-            "indirect": indirect,
             "landings": self._landings(scales),
             "layers": replace(self, scales=scales),
-        }
+        } | light
 
     def balance(self, scales: np.ndarray) -> dict[str, float]:
         """Power by where it went, W, channels added up."""
@@ -92,37 +95,72 @@ class Layers:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What an archive keeps."""
-        return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in ARRAYS}
+        kept = ARRAYS if self.caustic is None else (*ARRAYS, "caustic")
+        return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in kept}
 
     @staticmethod
     def load(data: Mapping[str, np.ndarray], lamps: Lamps, elements: Elements) -> "Layers":
-        """The layers in the arrays of an archive. Raises KeyError if some are missing."""
-        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in ARRAYS})
+        """The layers in the arrays of an archive.
+
+        Raises RadiosityError if its lamps have other names, so that they might be others.
+        """
+        if tuple(data["lamps"]) != lamps.names:
+            raise RadiosityError(
+                f"the lamps were called {', '.join(data['lamps'])}, and are called {', '.join(lamps.names)} now: "
+                "solve the scene again"
+            )
+        caustic = data.get("layers_caustic")
+        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in ARRAYS}, caustic=caustic)
 
 
 def solve_layers(
-    problem: Problem, rays: int, carry: Callable[[Problem, int, int, int], tuple], lamps: Lamps
+    problem: Problem, rays: int, carry: Callable[[Problem, int, int, int], Flow], lamps: Lamps
 ) -> tuple[Layers, list]:
     """Carry the power of every lamp by itself; returns the layers and their Flows.
 
-    carry(problem, rays, number, done) transports the power of the lamp of a number, after ``done`` rays, and returns
-    its Flow and its power [POWERS, 3]. Rays are shared out by power, LEAST_RAYS each at least.
+    carry(problem, rays, number, done) transports the power of the lamp of a number, after ``done`` rays. Rays are
+    shared out by power, LEAST_RAYS each at least.
     """
-    flows, powers, done = [], [], 0
+    flows, power, done = [], [], 0
     for number, (share, only) in enumerate(zip(_shares(lamps, rays), _one_by_one(len(lamps)))):
         model = lamps.dimmed(only)
         one = replace(problem, model=model, elements=_lit(problem.elements, lamps, model, only))
-        flow, power = carry(one, share, number, done)
-        flows.append(flow)
-        powers.append(power)
+        flows.append(carry(one, share, number, done))
+        power.append(powers(one, flows[-1]))
         done += share
 
     def stack(name):
-        return np.array([np.array(getattr(flow, name), dtype=np.float32).reshape(3, -1) for flow in flows])
+        light = [getattr(flow, name) for flow in flows]
+        known = [x is not None for x in light]
+        none = np.zeros((3, len(problem.elements)), dtype=np.float32)
+        rows = [np.array(x, dtype=np.float32).reshape(3, -1) if k else none for x, k in zip(light, known)]
+        return np.array(rows) if any(known) else None
 
     u, v = (np.array([np.array(getattr(flow.landings, x)) for flow in flows]) for x in "uv")
-    power, ones = np.array(powers).swapaxes(0, 1), np.ones((len(lamps), 3))
-    return Layers(lamps, problem.elements, stack("direct"), stack("indirect"), u, v, power, ones), flows
+    table, ones = np.array(power).swapaxes(0, 1), np.ones((len(lamps), 3))
+    light = {name: stack(name) for name in LIGHT}
+    return Layers(lamps, problem.elements, **light, u=u, v=v, power=table, scales=ones), flows
+
+
+def powers(problem: Problem, flow: Flow) -> np.ndarray:
+    """Emitted, absorbed, escaped and unshot power of a transport, and what of it is absorbed as it is shown, W
+    [POWERS, 3].
+
+    What is absorbed comes from irradiance, not from counting rays.
+    """
+    shot = flow.shot or flow
+    absorbed, shown = (_absorbed(problem, f.direct + f.indirect) + f.blocked for f in (shot, flow))
+    return np.array([shot.emitted, absorbed, shot.escaped, shot.unshot, shown])
+
+
+def _absorbed(problem, irradiance):
+    """(1 − ρ) H A of all leaves, W [3]."""
+    leaves, elements = problem.elements.leaves, problem.elements
+    kept = 1 - dr.gather(mi.Color3f, elements.reflectance, leaves)
+    absorbed = (
+        kept * dr.gather(mi.Color3f, irradiance, leaves) * dr.gather(mi.Float, problem.exposure.open_area, leaves)
+    )
+    return np.array(totals([mi.Float64(a) for a in absorbed]))
 
 
 def _lit(elements, lamps, model, scales):
@@ -137,11 +175,9 @@ def _one_by_one(count):
 
 def _shares(lamps, rays):
     """Whole numbers of rays for the lamps that add up to ``rays``, in proportion to their power (list)."""
-    spare = rays - LEAST_RAYS * len(lamps)
-    if spare < 0:
+    enough = LEAST_RAYS * len(lamps)
+    if rays < enough:
         raise RadiosityError(
-            f"{rays} rays are too few for {len(lamps)} lamp{'s' * (len(lamps) > 1)}: give at least {rays - spare}"
+            f"{rays} rays are too few for {len(lamps)} lamp{'s' * (len(lamps) > 1)}: give at least {enough}"
         )
-    power = lamps.power.sum(axis=1)
-    ends = np.round(np.cumsum(power) / power.sum() * spare).astype(np.int64)
-    return (np.diff(ends, prepend=0) + LEAST_RAYS).tolist()
+    return apportion(rays, lamps.power.sum(axis=1), LEAST_RAYS)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import NONE, owned, owned_vectors
+from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
@@ -29,12 +30,10 @@ from ..transport.probe import probe
 from .field import Field
 from .layers import ARRAYS, Layers, Scales
 
-FORMAT = 3
+FORMAT = 4
 TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
 COLORS = ("reflectance", "direct", "indirect")
 EXPOSURE = ("open_area", "crossed", "slot")
-LUMINANCE = (0.2126, 0.7152, 0.0722)  # Rec. 709 weights of linear RGB
-LUMENS_PER_WATT = 179.0  # Radiance's luminous efficacy of white light
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,10 @@ class Solution:
     """Radiosity of a scene, good for every view of it.
 
     model: the scene as patches. elements: the mesh. exposure: what of it is open. direct, indirect: irradiance H in
-    W/m² (Color3f [elements]) from the first flight of the lamps' light and from all later ones; interior elements
-    hold the area average. landings: where light came down on leaves that a wall crosses. stats: the numbers of the
-    run (see README). layers: the light of every lamp by itself, if it was asked for.
+    W/m² (Color3f [elements]), straight from the lamps and all other; interior elements hold the area average.
+    landings: where light came down on leaves that a wall crosses. stats: the numbers of the run (see README). layers:
+    the light of every lamp by itself, if it was asked for. caustic: the part of ``indirect`` that only shooting finds
+    (see `Flow`): surfaces show it as sharp as elements are, and points in free space are not told of it.
     """
 
     model: Model
@@ -73,6 +73,7 @@ class Solution:
     landings: Landings
     stats: dict
     layers: Layers | None = None
+    caustic: "mi.Color3f | None" = None
 
     def irradiance(
         self,
@@ -91,7 +92,9 @@ class Solution:
         points [n, 3] in m; normals [n, 3], of any length, towards the side that is lit; samples: lines to the lamps,
         and as many rays into the room, per point, rounded up to a multiple of 16. With ``return_error`` the result is
         a pair: the values and their standard errors, which are rather too large than too small, and do not know of
-        the errors of the solution. Without points: H of all elements (Color3f [elements]).
+        the errors of the solution. Light of lamps that no ray can meet, such as `point`, which comes through glass or
+        off mirrors, is known of surfaces only: points within 1 % of the scene's diagonal of one have its.
+        Without points: H of all elements (Color3f [elements]).
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
@@ -102,6 +105,9 @@ class Solution:
         gatherer = self.gatherer()
         report = partial(progress, "gather")
         found = probe(gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
+        if self.caustic is not None and len(where):
+            hit, near = self._surface_at(where, towards)
+            found[0][:] += self._on_patches(Field(self, self.caustic), hit, near)
         if lux:
             # The channels' errors go together, as their samples are the same.
             found = (LUMENS_PER_WATT * found[0] @ LUMINANCE, LUMENS_PER_WATT * found[1] @ LUMINANCE)
@@ -120,25 +126,33 @@ class Solution:
         where, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
         if len(where) == 0:
             return np.zeros((0, 3))
-        model, rays = self.model, self.model.rays
-        given = 0 * given if normals is None else given
-        face, u, v, near = nearest_face(model.faces, where, given, lift_of(model.faces))
-        facing = dr.dot(owned_vectors(mi.Vector3f, given), dr.gather(mi.Vector3f, rays.front, face))
-        front, back = (rays.side(face, dr.full(mi.Bool, side, len(where)), u, v, near) for side in (False, True))
-        behind = facing < 0 if normals is not None else front.patch == NONE
-        hit = dr.select(behind, back, front)
+        hit, near = self._surface_at(where, None if normals is None else given)
         return np.where(np.array(near)[:, None], np.array(self._shown_radiosity(hit)).T, np.nan)
+
+    def _surface_at(self, points, normals):
+        """The surface nearest to points, on the side of the normals, or of what is lit without (Hit); and is it near?
+        (Bool [n])"""
+        model, rays = self.model, self.model.rays
+        towards = np.zeros_like(points) if normals is None else normals
+        face, u, v, near = nearest_face(model.faces, points, towards, lift_of(model.faces))
+        facing = dr.dot(owned_vectors(mi.Vector3f, towards), dr.gather(mi.Vector3f, rays.front, face))
+        front, back = (rays.side(face, dr.full(mi.Bool, side, len(points)), u, v, near) for side in (False, True))
+        return dr.select(front.patch == NONE if normals is None else facing < 0, back, front), near
+
+    def _on_patches(self, field, hit, active):
+        """A field where something meets patches, 0 where not (NumPy [n, 3])."""
+        lit = active & (hit.patch != NONE)
+        leaf = self.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
+        return np.array(dr.select(lit, field.at(leaf, hit.u, hit.v, lit), 0)).T
 
     def _shown_radiosity(self, hit):
         """B where something meets patches, 0 where not (Color3f [n])."""
         patches, lit = self.model.patches, hit.patch != NONE
         patch = dr.select(lit, hit.patch, 0)
         leaf = self.elements.leaf_at(patch, hit.u, hit.v, lit)
-        rho = dr.gather(mi.Color3f, patches.reflectance, patch)
-        if self.model.materials.textured:
-            rho = self.model.materials.reflectance_at(dr.gather(mi.UInt32, patches.face, patch), hit.u, hit.v, hit.back)
-        B = dr.gather(mi.Color3f, patches.emission, patch) + rho * self.field.at(leaf, hit.u, hit.v, lit)
-        return dr.select(lit, B, 0)
+        emission = self.model.lights.at(patches, patch, hit.u, hit.v, lit)
+        reflectance = self.model.reflectance_at(patch, hit.u, hit.v, lit)
+        return dr.select(lit, emission + reflectance * self.field.at(leaf, hit.u, hit.v, lit), 0)
 
     @cached_property
     def field(self) -> Field:
@@ -230,6 +244,8 @@ class Solution:
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
+        if self.caustic is not None:
+            arrays["caustic"] = np.array(self.caustic, dtype=np.float32).reshape(3, -1)
         arrays |= self.layers.arrays() if self.layers else {}
         arrays |= {"landings": np.array([self.landings.u, self.landings.v]).reshape(2, -1)}
         with writing(path) as temporary, open(temporary, "wb") as file:
@@ -277,7 +293,9 @@ class Solution:
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)
-        solution = Solution(model, elements, exposure, direct, indirect, Landings(slots, *data["landings"]), stats)
+        caustic = owned_vectors(mi.Color3f, data["caustic"].T) if "caustic" in data else None
+        landings = Landings(slots, *data["landings"])
+        solution = Solution(model, elements, exposure, direct, indirect, landings, stats, caustic=caustic)
         if "lamps" not in data:
             return solution
         layers = Layers.load(data, Lamps(model), elements)

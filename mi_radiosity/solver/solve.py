@@ -5,17 +5,15 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..core.arrays import totals
 from ..core.errors import RadiosityError, interruptible
 from ..core.points import Stream, stream_seed
 from ..mesh import Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
-from ..transport import PILOT, Gathering, Problem, Shooting, Transport
-from .layers import POWERS, solve_layers
+from ..transport import PILOT, Gathering, Problem, Transport
+from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
 
@@ -47,15 +45,15 @@ def solve(
     to refine. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
     elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
-    transport, pilot: how power is carried over the finished mesh, and while it grows; `Shooting` and `PILOT` by
-    default. layers: keep the light of every lamp by itself, for `Solution.relight`; the rays are shared out by the
-    lamps' power. progress: called with (stage, done, total), stage being "refine" or "distribute" (total is None where
-    it is not known).
+    transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
+    default, while `Shooting()` shoots it only. layers: keep the light of every lamp by itself, for `Solution.relight`;
+    the rays are shared out by the lamps' power. progress: called with (stage, done, total), stage being "refine" or
+    "distribute" (total is None where it is not known).
 
     Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements. Raises RadiosityError for
     options and scenes that cannot be used.
     """
-    oracle, transport = oracle or GMI(0.5), transport or Shooting()
+    oracle, transport = oracle or GMI(0.5), transport or Gathering()
     _check(oracle, elements, epsilon, rays, lines)
     report, clock = progress or (lambda stage, done, total: None), _Clock()
 
@@ -82,29 +80,23 @@ def solve(
     clock.lap("refine")
 
     rays = int(rays or default_rays(tree.leaf_count))
-    shot = 0
 
     def carry(problem, rays_here, number=0, before=0):
-        """Transport with a part of the rays; returns a Flow and its power balance."""
-        nonlocal shot
-        gathering = Gathering(problem, rays_here, seed)
-        count = rays_here - gathering.rays
-        shot += count
+        """Transport with a part of the rays: a Flow."""
         stream = stream_seed(seed, Stream.POWER, number)
-        flow = transport(
-            problem, count, stream, refinement.first_share, lambda done: report("distribute", before + done, rays)
+        return transport(
+            problem, rays_here, stream, refinement.first_share, lambda done: report("distribute", before + done, rays)
         )
-        power = _balance(problem, flow)
-        return gathering.feed(flow, lambda done: report("distribute", before + count + done, rays)), power
 
     if layers:
         kept, flows = solve_layers(problem, rays, carry, Lamps(model))
         light, power = kept.summed(kept.scales), kept.balance(kept.scales)
     else:
-        flow, balance = carry(problem, rays)
-        flows, power = [flow], dict(zip(POWERS, balance.sum(axis=1).tolist()))
-        light = {name: getattr(flow, name) for name in ("direct", "indirect", "landings")}
+        flow = carry(problem, rays)
+        flows, power = [flow], dict(zip(POWERS, powers(problem, flow).sum(axis=1).tolist()))
+        light = {name: getattr(flow, name) for name in ("direct", "indirect", "caustic", "landings")}
         light |= {"model": model, "elements": mesh}
+    shot = sum((flow.shot or flow).rays for flow in flows)
     clock.lap("distribute")
 
     stats = {
@@ -113,7 +105,7 @@ def solve(
         "pairs": pairs.evaluated,
         "rays": sum(flow.rays for flow in flows),
         "power_rays": shot,
-        "gather_rays": rays - shot,
+        "gather_rays": sum(flow.rays for flow in flows) - shot,
         "oracle_rays": pairs.evaluated * pairs.lines if oracle.uses_lines else 0,
         "pilot_rays": refinement.rays,
         "iterations": max(flow.iterations for flow in flows),
@@ -124,7 +116,7 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
-        "warnings": _warnings(tree.leaf_count, rays),
+        "warnings": _warnings(tree.leaf_count, rays, light["caustic"]),
     } | ({"lamps": list(kept.names)} if layers else {})
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
@@ -144,12 +136,19 @@ def _check(oracle, elements, epsilon, rays, lines):
         raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
 
 
-def _warnings(elements, rays):
-    """What a user should know of the budget (list of str)."""
-    enough = FEW_RAYS * elements
-    if rays >= enough:
-        return []
-    return [f"{rays:,} rays are few for {elements:,} elements, and noisy: give {enough:,} or more, or fewer elements"]
+def _warnings(elements, rays, caustic):
+    """What a user should know of the budget, and of light that is shown less well (list of str)."""
+    enough, found = FEW_RAYS * elements, []
+    if rays < enough:
+        found.append(
+            f"{rays:,} rays are few for {elements:,} elements, and noisy: give {enough:,} or more, or fewer elements"
+        )
+    if caustic is not None and dr.any(caustic > 0, axis=None):
+        found.append(
+            "light of lamps that are no surfaces comes through glass or off mirrors: it is shown as sharp as elements "
+            "are, only known of surfaces, and not found by 'path' at all"
+        )
+    return found
 
 
 def default_rays(elements: int) -> int:
@@ -186,16 +185,3 @@ class _Clock:
 
     def seconds(self):
         return self._stages | {"total": self._last - self._start}
-
-
-def _balance(problem, flow):
-    """Emitted, absorbed, escaped and unshot power of a transport, W [POWERS, 3].
-
-    What is absorbed comes from its irradiance, not from counting rays.
-    """
-    leaves, elements = problem.elements.leaves, problem.elements
-    irradiance = dr.gather(mi.Color3f, flow.direct + flow.indirect, leaves)
-    lost = 1 - dr.gather(mi.Color3f, elements.reflectance, leaves)
-    absorbed = lost * irradiance * dr.gather(mi.Float, problem.exposure.open_area, leaves)
-    absorbed = np.array(totals([mi.Float64(a) for a in absorbed])) + flow.blocked
-    return np.array([flow.emitted, absorbed, flow.escaped, flow.unshot])

@@ -68,6 +68,8 @@ class LeafEmitter:
     it on from there; None for light of their own.
     """
 
+    unmet = False
+
     def __init__(
         self,
         problem: Problem,
@@ -110,10 +112,10 @@ class LeafEmitter:
 
 
 class LampEmitter:
-    """Sends the power of a lamp that is no surface."""
+    """Sends the power of a lamp that is no surface. ``unmet``: no ray can meet it, unlike the sky."""
 
     def __init__(self, light: Light) -> None:
-        self._light = light
+        self._light, self.unmet = light, not light.is_sky
 
     def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
         """``count`` rays as Batches."""

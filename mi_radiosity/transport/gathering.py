@@ -1,7 +1,8 @@
-"""The last step: every leaf gathers the light that is shown, saved and exported."""
+"""The usual transport: power is shot first, then every leaf gathers the light that is shown, saved and exported."""
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -14,35 +15,58 @@ from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
 from .problem import Flow, Problem
+from .series import Shooting, Transport
 
-SHARE = 0.8  # of the rays are gathered with; the others find the radiosity that is gathered
+SHOOTING = Shooting()
 RAYS_PER_LINE = 2  # rays into the room per line to the lamps
 LEAST = 16  # lines per leaf, or half of the mean
 
 
-class Gathering:
-    """Leaves look for light: along lines to the lamps, and along cosine-distributed rays into the room that power rays
-    have lit.
+@dataclass(frozen=True)
+class Gathering(Transport):
+    """Finds the radiosity by another transport; then leaves look for light: along lines to the lamps, and along
+    cosine-distributed rays into the room that power rays have lit.
 
     A gathered ray serves the leaf it is meant for, and where its power is seen; a ray that is shot lands where chance
-    has it. Large leaves get more, by the fourth root of their area, which was found best. ``rays`` is what the pass
-    costs; 0 where the budget has none to spare: then what was shot is shown.
+    has it. Large leaves get more, by the fourth root of their area, which was found best. Where the budget has no
+    rays to spare, what was shot is shown.
 
     What is shot keeps all power to the letter: what is gathered is scaled to its total, as far as that is known better.
+
+    first: what carries the power. share: of the rays are gathered with.
     """
 
-    def __init__(self, problem: Problem, budget: int, seed: int) -> None:
-        self._problem, self._seed = problem, stream_seed(seed, Stream.GATHER)
-        leaves = problem.elements.leaves
-        area = np.array(dr.gather(mi.Float, problem.exposure.open_area, leaves), dtype=np.float64)
-        lines = _share_out(area**0.25, int(SHARE * budget / (1 + RAYS_PER_LINE)))
-        self._lines, self._count = lines, int(lines.sum())
-        self.rays = (1 + RAYS_PER_LINE) * self._count
+    first: Transport = SHOOTING
+    share: float = 0.8
 
-    def feed(self, flow: Flow, progress: Callable[[int], None] = lambda done: None) -> Flow:
+    def __call__(
+        self,
+        problem: Problem,
+        rays: int,
+        seed: int,
+        first_share: float = 0.5,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Flow:
+        gathered = _Pass(problem, int(self.share * rays), stream_seed(seed, Stream.GATHER))
+        shot = self.first(problem, rays - gathered.rays, seed, first_share, progress)
+        return gathered.feed(shot, lambda done: progress(shot.rays + done)) if gathered.rays else shot
+
+
+class _Pass:
+    """One run of Gathering; ``rays`` is what it costs, ``budget`` at most."""
+
+    def __init__(self, problem: Problem, budget: int, seed: int) -> None:
+        self._problem, self._seed = problem, seed
+        lights, leaves = problem.model.lights, problem.elements.leaves
+        area = np.array(dr.gather(mi.Float, problem.exposure.open_area, leaves), dtype=np.float64)
+        # A line looks at one of the lamps that are surfaces, and at each of the others.
+        cost = RAYS_PER_LINE + len(lights.free) + bool(lights.exitance.any())
+        self._lines = _share_out(area**0.25, budget // cost)
+        self._count = int(self._lines.sum())
+        self.rays = cost * self._count
+
+    def feed(self, flow: Flow, progress: Callable[[int], None]) -> Flow:
         """``flow`` with its irradiance replaced by what the leaves gather."""
-        if self.rays == 0:
-            return flow
         e, exposure = self._problem.elements, self._problem.exposure
         reflected = e.reflectance * (flow.direct + flow.indirect)
         self._gatherer = Gatherer(self._problem.model, e, exposure, flow.landings, reflected)
@@ -53,17 +77,16 @@ class Gathering:
         for line in (True, False):
             each = 1 if line else RAYS_PER_LINE
             if not line:  # which meet the lamps' light as lines have found it
-                reflected = e.reflectance * (pull(e, self._means(alone), exposure.open_area) + flow.indirect)
+                reflected = e.reflectance * (pull(e, self._seen(alone), exposure.open_area) + flow.indirect)
                 self._gatherer = self._gatherer.seeing(reflected, self._landings.settled().filled_by(flow.landings))
             start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
             for sample in launches(self._count * each):
                 self._sample(sample, start, line, direct, alone if line else indirect)
-                done += dr.width(sample)
+                done += dr.width(sample) * ((self.rays // self._count - RAYS_PER_LINE) if line else 1)
                 progress(done)
-        fields = {}
-        for name, sums in (("direct", direct), ("indirect", indirect)):
-            fields[name] = pull(e, self._scaled(self._means(sums), flow, name), exposure.open_area)
-        return dataclasses.replace(flow, rays=flow.rays + self.rays, landings=self._landings.settled(), **fields)
+        light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(direct), self._means(indirect))))
+        landings = self._landings.settled()
+        return dataclasses.replace(flow, **light, landings=landings, rays=flow.rays + self.rays, shot=flow)
 
     def _means(self, sums):
         """Irradiance of the open part of the leaves from sums of their samples (3 Float64 [leaves])."""
@@ -71,28 +94,47 @@ class Gathering:
         whole = mi.Float64(1 / self._problem.exposure.open_share(e, e.leaves))
         return [c / lines * whole for c in sums.gather(dr.arange(mi.UInt32, dr.width(e.leaves)))]
 
-    def _scaled(self, gathered, flow, name):
-        """Gathered irradiance (3 Float64 [leaves]) that is absorbed in all as what was shot is, as far as that can be
-        trusted: in closed rooms, where no ray is lost, its total is exact."""
-        e = self._problem.elements
-        area = mi.Float64(dr.gather(mi.Float, self._problem.exposure.open_area, e.leaves))
+    def _seen(self, alone):
+        """Light of the lamps as lines have found it. Next to a lamp a line may find any multiple of what there is; as
+        no place has more light from surfaces than the brightest of them sends out, more than twice that is noise."""
+        means = self._means(alone)
+        if self._problem.model.lights.free:
+            return means
+        most = dr.max(self._problem.model.patches.emission, axis=1)
+        return [dr.minimum(h, mi.Float64(2 * c)) for h, c in zip(means, most)]
+
+    def _scaled(self, flow, direct, indirect):
+        """Gathered irradiance (two times 3 Float64 [leaves]) that is absorbed in all as what was shot is, as far as
+        that can be trusted: in closed rooms, where no ray is lost, its total is exact (two Color3f [elements]). What
+        only shooting finds is added."""
+        e, exposure = self._problem.elements, self._problem.exposure
+        area = mi.Float64(dr.gather(mi.Float, exposure.open_area, e.leaves))
         kept = [area * (1 - mi.Float64(r)) for r in dr.gather(mi.Color3f, e.reflectance, e.leaves)]
-        shot = dr.gather(mi.Color3f, getattr(flow, name), e.leaves)
-        have = totals([h * k for h, k in zip(gathered, kept)])
-        want = totals([mi.Float64(h) * k for h, k in zip(shot, kept)])
+        nothing = dr.zeros(mi.Color3f, len(e))
+        added = nothing, nothing if flow.caustic is None else flow.caustic
+        have = [totals([h * k for h, k in zip(light, kept)]) for light in (direct, indirect)]
+        want = [
+            totals([mi.Float64(h) * k for h, k in zip(dr.gather(mi.Color3f, light - more, e.leaves), kept)])
+            for light, more in zip((flow.direct, flow.indirect), added)
+        ]
+        if self._problem.model.rays.lobes is not None:  # how much of the light goes straight is known to chance only
+            have, want = (2 * [[a + b for a, b in zip(*both)]] for both in (have, want))
         lost = min(sum(flow.escaped) / sum(flow.emitted), 1 - 1e-6)
         # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
         noise = lost / (1 - lost) / max(flow.rays * flow.first_share, 1)
         trust = 1 / (1 + noise * self._count)
-        factors = [1 + trust * (w / t - 1) if t > 0 else 1.0 for w, t in zip(want, have)]
-        return [h * dr.opaque(mi.Float64, f) for h, f in zip(gathered, factors)]
+        for light, more, shown, total in zip((direct, indirect), added, have, want):
+            factors = [1 + trust * (w / h - 1) if h > 0 else 1.0 for w, h in zip(total, shown)]
+            light = [h * dr.opaque(mi.Float64, f) for h, f in zip(light, factors)]
+            light = [h + mi.Float64(c) for h, c in zip(light, dr.gather(mi.Color3f, more, e.leaves))]
+            yield pull(e, light, exposure.open_area)
 
     def _bound(self, flow):
-        """More than the samples of all leaves can add up to."""
+        """More than the samples of any leaf can add up to."""
         most = sum(
             dr.max(light, axis=None)[0] for light in (self._problem.model.patches.emission, flow.direct + flow.indirect)
         )
-        return 1e3 * most * self._count
+        return 1e5 * most * int(self._lines.max())
 
     def _sample(self, sample, start, line, direct, other):
         """Add up samples (UInt32 [n]): lines to lamps if ``line``, else rays into the room. ``other`` sums what lines

@@ -36,7 +36,9 @@ class Record:
 class Flow:
     """What one transport did. Power in W per channel, irradiance in W/m².
 
-    ``direct`` and ``indirect`` are Color3f [elements]: right at the leaves, area averages at their ancestors.
+    Irradiances are Color3f [elements]: right at the leaves, area averages at their ancestors. ``direct`` came straight
+    from the lamps, ``indirect`` is all other light. ``caustic`` is the part of it that only shooting finds: light of
+    lamps that no ray can meet, such as `point`, which came through lobes that are traced (None where there is none).
     """
 
     direct: "mi.Color3f"
@@ -50,3 +52,5 @@ class Flow:
     blocked: list[float]  # absorbed by sides that reflect nothing, and by lobes that are traced
     unshot: list[float]
     records: tuple[Record, ...] = ()
+    caustic: "mi.Color3f | None" = None
+    shot: "Flow | None" = None  # what the light was gathered from, if it was; its power is kept to the letter

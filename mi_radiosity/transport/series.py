@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE, opaque_index, totals
+from ..core.arrays import NONE, apportion, opaque_index, totals
 from ..core.points import Stream, hash_pair, stream_seed
 from ..mesh.hierarchy import pull, push
 from .deposit import pair_of, spread, straight, trusted
@@ -88,7 +88,9 @@ class _Series:
         self.unshot = [sum(p) for p in zip(self.on_surfaces, *(power for _, power in self.lamps))]
         self.emitted, self.escaped, self.blocked = self.unshot, [0.0] * 3, [0.0] * 3
         n = dr.width(elements.leaves)
-        self.direct, self.indirect = ([dr.zeros(mi.Float64, n) for _ in range(3)] for _ in range(2))
+        self.direct, self.indirect, self.caustic = ([dr.zeros(mi.Float64, n) for _ in range(3)] for _ in range(3))
+        self.traces = problem.model.rays.lobes is not None
+        self.focuses = self.traces and any(not light.is_sky for light in problem.model.lights.free)
         self.share, self.left, self.shot, self.iteration = first_share, rays, 0.0, 0
         self.landings, self.all_landings = None, Landings(problem.exposure.slots)
         self.records: list[Record] = []
@@ -98,18 +100,21 @@ class _Series:
         little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted)
         last = self.iteration > 0 and (self.iteration == ITERATIONS - 1 or little)
         count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * self.share)))
-        tally = self._shoot(count, progress)
+        tally, direct, focused = self._shoot(count, progress)
         self.left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
         scale = [u / s if s > 0 else 0.0 for u, s in zip(self.unshot, tally.sent())]
-        received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
-        received = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
-        dr.eval(received)
+        received = self._received(tally, scale)
         self.power = [h * r * self.area for h, r in zip(received, self.reflectance)]
         after = totals(self.power)
         closes = self.left == 0
         closure = [1 / max(1 - a / u, 1e-6) if closes and u > 0 else 1.0 for a, u in zip(after, self.unshot)]
-        self._add(received, closure)
+        self.indirect = [i + h * dr.opaque(mi.Float64, c) for i, h, c in zip(self.indirect, received, closure)]
+        if self.iteration == 0:
+            self.direct = received if direct is None else self._received(direct, scale)
+            self.indirect = [i - h for i, h in zip(self.indirect, self.direct)]
+            self.caustic = self.caustic if focused is None else self._received(focused, scale)
+        dr.eval(self.direct, self.indirect, self.power)
         bins = (self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED), (self.blocked, Tally.TAKEN)
         for lost, which in bins:
             lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
@@ -118,41 +123,40 @@ class _Series:
         self.unshot = after if self.left else [0.0] * 3
         self.iteration += 1
 
-    def _add(self, received, closure):
-        """Add irradiance to the sums; what comes from lamps is direct, once."""
-        first = self.iteration == 0
-        for c in range(3):
-            more = received[c] * dr.opaque(mi.Float64, closure[c] - first)
-            self.indirect[c] = self.indirect[c] + more
-            if first:
-                self.direct[c] = self.direct[c] + received[c]
-        dr.eval(self.direct, self.indirect, self.power)
+    def _received(self, tally, scale):
+        """Irradiance of the leaves from a Tally (3 Float64 [leaves])."""
+        received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
+        received = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
+        dr.eval(received)
+        return received
 
     def _emitters(self, count):
         """Who shoots in this iteration, and how many rays."""
         if self.iteration or not self.lamps:
             return [(LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings), count)]
-        shares = [(emitter, round(count * sum(power) / sum(self.unshot))) for emitter, power in self.lamps]
-        rest = count - sum(n for _, n in shares)
+        powers, emitters = [sum(power) for _, power in self.lamps], [emitter for emitter, _ in self.lamps]
         if sum(self.on_surfaces) > 0:
-            surfaces = LeafEmitter(self.problem, self.power, sum(self.on_surfaces), self.how.numbering)
-            return [(surfaces, max(rest, LEAST_RAYS))] + shares
-        return [(shares[0][0], shares[0][1] + rest), *shares[1:]]
+            powers.append(sum(self.on_surfaces))
+            emitters.append(LeafEmitter(self.problem, self.power, powers[-1], self.how.numbering))
+        return list(zip(emitters, apportion(count, powers, 1)))
 
     def _shoot(self, count, progress):
-        """Cast ``count`` rays and tally what arrives where."""
-        tally = Tally(len(self.problem.elements), self.unshot, self.problem.model.rays.lobes is not None)
+        """Cast ``count`` rays and tally what arrives where: in all; straight, and focused (see `Flow`), if the first
+        rays may come otherwise."""
+        first, n = self.iteration == 0, len(self.problem.elements)
+        tally = Tally(n, self.unshot, self.traces)
+        direct, focused = (Tally(n, self.unshot) if first and x else None for x in (self.traces, self.focuses))
         landings = Landings(self.problem.exposure.slots)
         cast = self.rays - self.left
         for emitter, share in self._emitters(count):
             for batch in emitter.batches(share, self.iteration, self.seed):
-                self._cast(batch, tally, landings)
+                self._cast(batch, tally, landings, direct, focused if emitter.unmet else None)
                 cast += dr.width(batch.number)
                 progress(cast)
         self.landings = landings.settled()
-        return tally
+        return tally, direct, focused
 
-    def _cast(self, batch, tally, landings):
+    def _cast(self, batch, tally, landings, direct, focused):
         problem = self.problem
         seed = opaque_index(stream_seed(self.seed, Stream.LOBES, self.iteration))
         hit = problem.model.rays.follow(batch.origin, batch.direction, batch.number, seed, power=True)
@@ -162,6 +166,9 @@ class _Series:
         # Rays that start inside a solid go nowhere; the others of their element carry their power.
         goes = ~batch.doubtful | on_patch | ~hit.valid | hit.traced
         tally.add(batch, hit, receiver, batch.starts & goes)
+        for part, through in ((direct, False), (focused, True)):
+            if part is not None:
+                part.add(batch, hit, receiver, batch.starts & goes & (hit.bounced == through))
         if self.how.records:
             met = dr.select(straight(batch, hit), hit.patch, NONE)
             record = Record(met, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)
@@ -175,10 +182,10 @@ class _Series:
 
     def flow(self):
         elements, area = self.problem.elements, self.problem.exposure.open_area
-        direct, indirect = (pull(elements, values, area) for values in (self.direct, self.indirect))
         return Flow(
-            direct=direct,
-            indirect=indirect,
+            direct=pull(elements, self.direct, area),
+            indirect=pull(elements, self.indirect, area),
+            caustic=pull(elements, self.caustic, area) if self.focuses else None,
             landings=self.all_landings.settled(),
             rays=self.rays - self.left,
             iterations=self.iteration,

@@ -1,0 +1,84 @@
+"""What commands share: warnings, progress bars, and the reading of numbers and views."""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .errors import RadiosityError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+PROGRAM = "mi-radiosity"
+STAGES = {
+    "refine": "Refining",
+    "distribute": "Distributing power",
+    "trace": "Tracing rays",
+    "connect": "Connecting facets",
+    "write": "Writing",
+}
+
+Report = Callable[[str, int, int | None], None]
+
+
+def warn(messages: Iterable[str]) -> None:
+    """Print warnings on standard error, a line each."""
+    for message in messages:
+        print(f"{PROGRAM}: warning: {message}", file=sys.stderr)
+
+
+def positive(text: str) -> int:
+    """The whole number > 0 that an option is given."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number greater than 0")
+    return value
+
+
+def shading_argument(parser: argparse.ArgumentParser, default: str = "gouraud") -> None:
+    """Add --shading; its name is checked when plugins have defined theirs."""
+    names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"
+    parser.add_argument("--shading", default=default, metavar="NAME", help=names)
+
+
+def view_name(path: Path, view: int, views: Sequence[int]) -> Path:
+    """``path`` itself, or with the number of the view if there are several."""
+    return path if len(views) == 1 else path.with_name(f"{path.stem}_{view}{path.suffix}")
+
+
+def choose_views(scene: "mi.Scene", text: str) -> list[int]:
+    """Sensor numbers meant by --view."""
+    count = len(scene.sensors())
+    if count == 0:
+        raise RadiosityError("the scene has no sensor: add one to the file")
+    if text == "all":
+        return list(range(count))
+    if not text.isdigit() or int(text) >= count:
+        raise RadiosityError(
+            f"--view {text}: the scene has {count} sensor{'s' * (count > 1)}, counted from 0; choose one or 'all'"
+        )
+    return [int(text)]
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report]:
+    """Yield report(stage, done, total), which draws one bar per stage on standard error."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    tasks: dict[str, Any] = {}
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as progress:
+
+        def report(stage, done, total):
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(STAGES.get(stage, stage.capitalize()), total=total)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield report
