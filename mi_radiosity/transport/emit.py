@@ -65,7 +65,7 @@ class LeafEmitter:
     leaves, cosine-distributed, low-discrepancy in position and direction.
 
     numbering: `numbered_through` or `numbered_by_leaf`. landings: where light came down on crossed leaves, which send
-    it on from there; None for light of their own.
+    it on from there; None for light of their own. even: share of the rays given to all leaves that have power alike.
     """
 
     unmet = False
@@ -77,11 +77,16 @@ class LeafEmitter:
         total: float,
         numbering: Callable,
         landings: Landings | None = None,
+        even: float = 0,
     ) -> None:
         self.elements, self.leaves = problem.elements, problem.elements.leaves
         self._rays, self._exposure, self._landings = problem.model.rays, problem.exposure, landings
         self._power, self._numbering = power, numbering
-        self._distribution = Distribution(power[0] + power[1] + power[2], total)
+        weight = power[0] + power[1] + power[2]
+        if even:
+            alike = dr.select(weight > 0, dr.opaque(mi.Float64, even * total), 0) / dr.count(weight > 0)
+            weight = weight * (1 - even) + alike
+        self._distribution = Distribution(weight, total)
 
     def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
         """``count`` rays as Batches."""

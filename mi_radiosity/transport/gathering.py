@@ -14,7 +14,7 @@ from ..mesh.hierarchy import pull
 from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
-from .problem import Flow, Problem
+from .problem import Flow, Known, Problem
 from .series import Shooting, Transport
 
 SHOOTING = Shooting()
@@ -24,8 +24,8 @@ LEAST = 16  # lines per leaf, or half of the mean
 
 @dataclass(frozen=True)
 class Gathering(Transport):
-    """Finds the radiosity by another transport; then leaves look for light: along lines to the lamps, and along
-    cosine-distributed rays into the room that power rays have lit.
+    """Leaves look for light: along lines to the lamps; then, when another transport has found the radiosity, starting
+    from what lines have found, along cosine-distributed rays into the room.
 
     A gathered ray serves the leaf it is meant for, and where its power is seen; a ray that is shot lands where chance
     has it. Large leaves get more, by the fourth root of their area, which was found best. Where the budget has no
@@ -47,16 +47,22 @@ class Gathering(Transport):
         first_share: float = 0.5,
         progress: Callable[[int], None] = lambda done: None,
     ) -> Flow:
-        gathered = _Pass(problem, int(self.share * rays), stream_seed(seed, Stream.GATHER))
-        shot = self.first(problem, rays - gathered.rays, seed, first_share, progress)
-        return gathered.feed(shot, lambda done: progress(shot.rays + done)) if gathered.rays else shot
+        gathered = _Pass(problem, int(self.share * rays), stream_seed(seed, Stream.GATHER), progress)
+        if gathered.rays == 0:
+            return self.first(problem, rays, seed, first_share, progress)
+        known = gathered.look_at_lamps()
+        done = gathered.done
+        problem = dataclasses.replace(problem, known=known)
+        shot = self.first(problem, rays - gathered.rays, seed, first_share, lambda more: progress(done + more))
+        return gathered.look_around(shot, known)
 
 
 class _Pass:
-    """One run of Gathering; ``rays`` is what it costs, ``budget`` at most."""
+    """One run of Gathering; ``rays`` is what it costs, ``budget`` at most, and ``done`` how many of them are cast."""
 
-    def __init__(self, problem: Problem, budget: int, seed: int) -> None:
-        self._problem, self._seed = problem, seed
+    def __init__(self, problem: Problem, budget: int, seed: int, progress: Callable[[int], None]) -> None:
+        self._problem, self._seed, self._progress = problem, seed, progress
+        self.done = self._before = 0
         lights, leaves = problem.model.lights, problem.elements.leaves
         area = np.array(dr.gather(mi.Float, problem.exposure.open_area, leaves), dtype=np.float64)
         # A line looks at one of the lamps that are surfaces, and at each of the others.
@@ -65,28 +71,38 @@ class _Pass:
         self._count = int(self._lines.sum())
         self.rays = cost * self._count
 
-    def feed(self, flow: Flow, progress: Callable[[int], None]) -> Flow:
-        """``flow`` with its irradiance replaced by what the leaves gather."""
-        e, exposure = self._problem.elements, self._problem.exposure
-        reflected = e.reflectance * (flow.direct + flow.indirect)
-        self._gatherer = Gatherer(self._problem.model, e, exposure, flow.landings, reflected)
+    def look_at_lamps(self) -> Known:
+        """Irradiance straight from the lamps, by lines to them."""
+        e, exposure, model = self._problem.elements, self._problem.exposure, self._problem.model
+        bound = [1e5 * self._most_from_lamps() * int(self._lines.max())] * 3
+        self._direct, self._alone = (ColorSums(dr.width(e.leaves), bound) for _ in range(2))
         self._landings = Landings(exposure.slots)
-        bound = 3 * [self._bound(flow)]
-        direct, indirect, alone = (ColorSums(dr.width(e.leaves), bound) for _ in range(3))
-        done = 0
-        for line in (True, False):
-            each = 1 if line else RAYS_PER_LINE
-            if not line:  # which meet the lamps' light as lines have found it
-                reflected = e.reflectance * (pull(e, self._seen(alone), exposure.open_area) + flow.indirect)
-                self._gatherer = self._gatherer.seeing(reflected, self._landings.settled().filled_by(flow.landings))
-            start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
-            for sample in launches(self._count * each):
-                self._sample(sample, start, line, direct, alone if line else indirect)
-                done += dr.width(sample) * ((self.rays // self._count - RAYS_PER_LINE) if line else 1)
-                progress(done)
-        light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(direct), self._means(indirect))))
+        self._gatherer = Gatherer(model, e, exposure, self._landings, dr.zeros(mi.Color3f, len(e)))
+        self._sample_all(1, self._alone)
+        return Known(self._seen(), self._landings.settled())
+
+    def look_around(self, flow: Flow, known: Known) -> Flow:
+        """``flow`` with its irradiance replaced by what the leaves gather in the room, and have found of the lamps."""
+        e, exposure = self._problem.elements, self._problem.exposure
+        reflected = e.reflectance * (pull(e, known.direct, exposure.open_area) + flow.indirect)
+        self._gatherer = self._gatherer.seeing(reflected, known.landings.filled_by(flow.landings))
+        most = self._most_from_lamps() + dr.max(flow.direct + flow.indirect, axis=None)[0]
+        indirect = ColorSums(dr.width(e.leaves), [1e5 * most * int(self._lines.max())] * 3)
+        self._before = flow.rays
+        self._sample_all(RAYS_PER_LINE, indirect)
+        light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(self._direct), self._means(indirect))))
         landings = self._landings.settled()
         return dataclasses.replace(flow, **light, landings=landings, rays=flow.rays + self.rays, shot=flow)
+
+    def _sample_all(self, each, sums):
+        """So many samples per line of all leaves, into ``sums`` and those of direct light."""
+        start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
+        line = sums is self._alone
+        cost = self.rays // self._count - RAYS_PER_LINE if line else 1
+        for sample in launches(self._count * each):
+            self._sample(sample, start, line, sums)
+            self.done += dr.width(sample) * cost
+            self._progress(self._before + self.done)
 
     def _means(self, sums):
         """Irradiance of the open part of the leaves from sums of their samples (3 Float64 [leaves])."""
@@ -94,10 +110,10 @@ class _Pass:
         whole = mi.Float64(1 / self._problem.exposure.open_share(e, e.leaves))
         return [c / lines * whole for c in sums.gather(dr.arange(mi.UInt32, dr.width(e.leaves)))]
 
-    def _seen(self, alone):
+    def _seen(self):
         """Light of the lamps as lines have found it. Next to a lamp a line may find any multiple of what there is; as
         no place has more light from surfaces than the brightest of them sends out, more than twice that is noise."""
-        means = self._means(alone)
+        means = self._means(self._alone)
         if self._problem.model.lights.free:
             return means
         most = dr.max(self._problem.model.patches.emission, axis=1)
@@ -129,14 +145,13 @@ class _Pass:
             light = [h + mi.Float64(c) for h, c in zip(light, dr.gather(mi.Color3f, more, e.leaves))]
             yield pull(e, light, exposure.open_area)
 
-    def _bound(self, flow):
-        """More than the samples of any leaf can add up to."""
-        most = sum(
-            dr.max(light, axis=None)[0] for light in (self._problem.model.patches.emission, flow.direct + flow.indirect)
-        )
-        return 1e5 * most * int(self._lines.max())
+    def _most_from_lamps(self):
+        """E of the brightest lamp; of lamps that are no surfaces, what they would give all of the scene's area."""
+        model = self._problem.model
+        free = sum(sum(light.power()) for light in model.lights.free) / model.patches.total_area
+        return dr.max(model.patches.emission, axis=None)[0] + 1e3 * free
 
-    def _sample(self, sample, start, line, direct, other):
+    def _sample(self, sample, start, line, other):
         """Add up samples (UInt32 [n]): lines to lamps if ``line``, else rays into the room. ``other`` sums what lines
         find by themselves, and what rays find in the room."""
         problem = self._problem
@@ -159,7 +174,7 @@ class _Pass:
             found, lamps = self._gatherer.rays(places, direction, sample, seed, RAYS_PER_LINE, on_top)
             lamps, found = lamps / RAYS_PER_LINE, found / RAYS_PER_LINE
         other.add(found, row, on_top)
-        direct.add(lamps, row, on_top)
+        self._direct.add(lamps, row, on_top)
         lit = on_top & (dr.max(lamps + found) > 0)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
         self._landings.offer(slot, u, v, sample ^ (0 if line else 0x80000000), lit & (slot != NONE))

@@ -17,6 +17,16 @@ class Problem:
     elements: Elements
     pairs: Pairs
     exposure: Exposure
+    known: "Known | None" = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """Irradiance straight from the lamps that is known beforehand (3 Float64 [leaves], W/m²), and where it came down. A
+    transport may start from it; what it sends from there is better than what it had shot there."""
+
+    direct: "list[mi.Float64]"
+    landings: Landings
 
 
 @dataclass

@@ -17,6 +17,7 @@ from .tally import Tally
 
 ITERATIONS = 64  # after so many the rest is summed in closed form
 LEAST_RAYS = 64  # of an iteration
+GLANCE = 0.25  # of the lamps' rays, where only their total is asked for
 
 
 class Transport:
@@ -45,14 +46,17 @@ class Shooting(Transport):
     The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration, every later one
     takes 1 − λ of the rays left, so that all rays carry about the same power. Once less than ``tail`` of the power is
     left, the last iteration stands for all that would follow, H_k (1 + λ + λ² + …) (Lyusternik's closure): no power
-    is lost however large ρ is.
+    is lost however large ρ is. Where the light straight from the lamps is `Known`, their rays only find how much of it
+    there is in all, and what comes through lobes; a few do.
 
-    tail: share of the power below which the rest is summed in closed form. numbering: which points rays have.
-    deposit: who receives their power. records: keep the rays, to discover pairs with.
+    tail: share of the power below which the rest is summed in closed form. even: share of the rays that leaves get
+    however little power they have: a room that is lit through a window has little of all. numbering: which points rays
+    have. deposit: who receives their power. records: keep the rays, to discover pairs with.
     Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
     """
 
     tail: float = 0.0001  # little of the sun comes into a room, and is not to end with what stays outside
+    even: float = 0.25
     numbering: Callable = numbered_through
     deposit: Callable = trusted
     records: bool = False
@@ -71,7 +75,7 @@ class Shooting(Transport):
         return series.flow()
 
 
-PILOT = Shooting(tail=0.1, numbering=numbered_by_leaf, deposit=spread, records=True)
+PILOT = Shooting(tail=0.1, even=0, numbering=numbered_by_leaf, deposit=spread, records=True)
 
 
 class _Series:
@@ -99,19 +103,23 @@ class _Series:
         """Shoot what is unshot; what is reflected of it becomes the unshot power of the next iteration."""
         little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted)
         last = self.iteration > 0 and (self.iteration == ITERATIONS - 1 or little)
-        count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * self.share)))
+        share = self.share * (GLANCE if self.iteration == 0 and self.problem.known and not self.traces else 1)
+        count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * share)))
         tally, direct, focused = self._shoot(count, progress)
         self.left -= count
         # Systematic sampling keeps the total only to a few rays: restore it exactly.
         scale = [u / s if s > 0 else 0.0 for u, s in zip(self.unshot, tally.sent())]
         received = self._received(tally, scale)
+        if self.iteration == 0:
+            straight = received if direct is None else self._received(direct, scale)
+            self.direct = self._better(straight)
+            received = [h - a + b for h, a, b in zip(received, straight, self.direct)]
         self.power = [h * r * self.area for h, r in zip(received, self.reflectance)]
         after = totals(self.power)
         closes = self.left == 0
         closure = [1 / max(1 - a / u, 1e-6) if closes and u > 0 else 1.0 for a, u in zip(after, self.unshot)]
         self.indirect = [i + h * dr.opaque(mi.Float64, c) for i, h, c in zip(self.indirect, received, closure)]
         if self.iteration == 0:
-            self.direct = received if direct is None else self._received(direct, scale)
             self.indirect = [i - h for i, h in zip(self.indirect, self.direct)]
             self.caustic = self.caustic if focused is None else self._received(focused, scale)
         dr.eval(self.direct, self.indirect, self.power)
@@ -123,6 +131,15 @@ class _Series:
         self.unshot = after if self.left else [0.0] * 3
         self.iteration += 1
 
+    def _better(self, shot):
+        """Irradiance straight from the lamps: what is known of it, as much in all as was shot (3 Float64 [leaves])."""
+        known = self.problem.known
+        if known is None:
+            return shot
+        self.landings = known.landings.filled_by(self.landings)
+        have, want = (totals([h * self.area for h in light]) for light in (known.direct, shot))
+        return [k * dr.opaque(mi.Float64, w / h) if h > 0 else s for k, s, h, w in zip(known.direct, shot, have, want)]
+
     def _received(self, tally, scale):
         """Irradiance of the leaves from a Tally (3 Float64 [leaves])."""
         received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
@@ -133,7 +150,9 @@ class _Series:
     def _emitters(self, count):
         """Who shoots in this iteration, and how many rays."""
         if self.iteration or not self.lamps:
-            return [(LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings), count)]
+            even = self.how.even if self.iteration else 0
+            reflected = LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings, even)
+            return [(reflected, count)]
         powers, emitters = [sum(power) for _, power in self.lamps], [emitter for emitter, _ in self.lamps]
         if sum(self.on_surfaces) > 0:
             powers.append(sum(self.on_surfaces))
