@@ -103,18 +103,22 @@ def _integrator_class():
                 hit = rays.locate(rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray.d)
             else:
                 number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
-                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active)
+                lamps = solution.gatherer.highlights
+                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active, highlights=lamps)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
             reflectance = model.reflectance_at(hit.patch, hit.u, hit.v, lit)
             emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
             emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, emits)
+            if rays.lobes is not None:
+                emission *= hit.share
             look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
             if model.lights.sky_light and not self.hide_emitters:
                 direction = ray.d if rays.lobes is None else hit.direction
-                radiance += model.lights.sky(direction, active & ~hit.valid) * dr.inv_pi
+                seen = 1 if rays.lobes is None else hit.share
+                radiance += model.lights.sky(direction, active & ~hit.valid) * seen * dr.inv_pi
                 valid |= active
             if rays.lobes is not None:
                 radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)

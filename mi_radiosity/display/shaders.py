@@ -119,7 +119,7 @@ class Gather(Shader):
 
     def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
-        self._gatherer = solution.gatherer()
+        self._gatherer = solution.gatherer
         # What no sample can find is shown as it was shot.
         self._caustic = None if solution.caustic is None else Field(solution, solution.caustic)
 

@@ -22,7 +22,9 @@ class Trail:
     other lobes, too, times the weight of the diffuse lobe that was drawn over its mean ρ, so that the mean is right.
     ``taken``: power that the lobes on the way kept, less what they sent on from surfaces that count all of
     theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
-    the end included (it is ``coated``), times the weight there, W/m².
+    the end included (it is ``coated``), and of lamps that lines from rough lobes have found, times the weight there,
+    W/m². ``share``: of the lamp that the end is on, or of the sky, what those lines leave to the ray. ``rough``: the
+    first surface with lobes is such a one.
     """
 
     valid: "mi.Bool"
@@ -36,6 +38,14 @@ class Trail:
     coated: "mi.Bool"
     taken: "mi.Color3f"
     glow: "mi.Color3f"
+    share: "mi.Float"
+    rough: "mi.Bool"
+
+
+def is_glossy(bsdf: "mi.BSDFPtr") -> "mi.Bool":
+    """Have BSDFs rough lobes and no diffuse one, so that all they send on of a lamp is theirs (Bool [n])?"""
+    flags = bsdf.flags()
+    return mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Diffuse)
 
 
 class Lobes:
@@ -50,40 +60,66 @@ class Lobes:
         mode: "mi.TransportMode",
         camera: bool,
         active: "mi.Bool | bool" = True,
+        highlights: Any = None,
     ) -> Trail:
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
 
         mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.
-        camera: the first surface's own light counts, too.
+        camera: the first surface's own light counts, too. highlights: how rough lobes see lamps; without, only by
+        their own rays.
         """
         ctx, n = mi.BSDFContext(mode), dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
         alive, no = mi.Bool(active) & dr.full(mi.Bool, True, n), dr.zeros(mi.Bool, n)
         nought, black = dr.zeros(mi.Float, n), dr.zeros(mi.Color3f, n)
         nowhere = dr.full(mi.UInt32, NONE, n)
-        start = Trail(no, nowhere, nought, nought, mi.Vector3f(ray.d), black + 1, no, no, no, black, black)
+        start = Trail(
+            valid=no,
+            patch=nowhere,
+            u=nought,
+            v=nought,
+            direction=mi.Vector3f(ray.d),
+            weight=black + 1,
+            bounced=no,
+            traced=no,
+            coated=no,
+            taken=black,
+            glow=black,
+            share=nought + 1,
+            rough=no,
+        )
 
-        def step(alive, ray, depth, random, trail):
-            return self._step(rays, ctx, camera, alive, ray, depth, random, trail)
+        def step(alive, ray, pdf, depth, random, trail):
+            return self._step(rays, ctx, camera, highlights, alive, ray, pdf, depth, random, trail)
 
-        state = (alive, mi.Ray3f(ray), dr.zeros(mi.UInt32, n), random, start)
+        state = (alive, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
         return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
 
-    def _step(self, rays, ctx, camera, alive, ray, depth, random, trail):
-        """One more hit."""
+    def _step(self, rays, ctx, camera, highlights, alive, ray, pdf, depth, random, trail):
+        """One more hit, of rays drawn with densities ``pdf`` where lines look for lamps as well, else 0."""
         prelim = rays.scene.ray_intersect_preliminary(ray, active=alive)
         hit, before = rays.locate(prelim, ray.d), trail.weight
         si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, hit.traced)
         s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
-        sample, value = si.bsdf(ray).sample(ctx, si, s, st, hit.traced)
+        bsdf = si.bsdf(ray)
+        sample, value = bsdf.sample(ctx, si, s, st, hit.traced)
         value = dr.select(hit.traced & dr.isfinite(value), value, 0)
         drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
         on_patch = hit.patch != NONE
         coated = hit.traced & drawn & on_patch & (dr.max(value) > 0)
         on = hit.traced & ~coated
+        rough, share = dr.zeros(mi.Bool, dr.width(ray.d)), mi.Float(1)
+        if rays.glossy:
+            rough = on & is_glossy(bsdf)
+        if rays.glossy and highlights is not None:
+            share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
+            unlikely = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
+            pdf = dr.select(rough & ~unlikely, sample.pdf, 0)
 
         shines = hit.traced & on_patch & (trail.bounced | camera)
-        glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines)
+        glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
+        if rays.glossy and highlights is not None:
+            glow += before * highlights.light(ctx, bsdf, si, random, rough)
         rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
         factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that meets them as received, the others nothing.
@@ -105,6 +141,8 @@ class Lobes:
             coated=coated,
             taken=trail.taken + taken,
             glow=trail.glow + glow,
+            share=dr.select(alive, share, trail.share),
+            rough=dr.select(trail.bounced, trail.rough, rough),
         )
         ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
-        return goes_on, ray, depth, random, trail
+        return goes_on, ray, pdf, depth, random, trail

@@ -12,6 +12,7 @@ from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .faces import Faces
 from .lights import LIGHTS
+from .lobes import is_glossy
 from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
@@ -26,7 +27,8 @@ AT_ONCE = 1 << 22  # samples in one launch
 
 class Materials:
     """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
-    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes].
+    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]; ``glossy``: are
+    there rough lobes without a diffuse one?
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -38,6 +40,7 @@ class Materials:
         self.two_sided = two_sided[faces.shape]
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
         self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
+        self.glossy = dr.any(is_glossy(mi.BSDFPtr([s.bsdf() for s in shapes])))
         self._traced_faces = owned(mi.UInt32, self.traced[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))

@@ -1,6 +1,7 @@
 """Rays between patches: where they end, what they miss, and the kernel F along them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -32,7 +33,7 @@ class Rays:
     def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
         self.scene, self.patches = faces.tracing, patches
         self._materials = materials
-        self.lobes = Lobes() if materials.traced.any() else None
+        self.lobes, self.glossy = Lobes() if materials.traced.any() else None, materials.glossy
         self._first_face = faces.first_face
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
@@ -74,16 +75,17 @@ class Rays:
         power: bool = False,
         camera: bool = False,
         active: "mi.Bool | bool" = True,
+        highlights: Any = None,
     ) -> Hit | Trail:
         """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
 
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
-        camera: they look for light, and the first surface's own counts.
+        camera: they look for light, and the first surface's own counts. highlights: see `Lobes.follow`.
         """
         if self.lobes is None:
             return self.trace(origin, direction, active)
         mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
-        return self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, active)
+        return self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, active, highlights)
 
     def on_top(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Bool":
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""

@@ -102,9 +102,8 @@ class Solution:
         where, towards = _checked_points(points, normals)
         if samples < 1:
             raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
-        gatherer = self.gatherer()
         report = partial(progress, "gather")
-        found = probe(gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
+        found = probe(self.gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
         if self.caustic is not None and len(where):
             hit, near = self._surface_at(where, towards)
             found[0][:] += self._on_patches(Field(self, self.caustic), hit, near)
@@ -159,6 +158,7 @@ class Solution:
         """H as a continuous field over the surfaces."""
         return Field(self)
 
+    @cached_property
     def gatherer(self) -> Gatherer:
         """What gathers irradiance at any places, by this solution's radiosity."""
         return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())

@@ -10,6 +10,7 @@ from ..core.arrays import NONE
 from ..core.points import triangle
 from ..mesh import Elements, Exposure
 from ..scene import Model
+from .highlights import Highlights
 from .lamps import LampChoice
 from .landings import Landings
 
@@ -39,6 +40,7 @@ class Gatherer:
         self._exposure, self._landings = exposure, landings
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
+        self.highlights = Highlights(model, self._lamps) if model.rays.glossy else None
 
     def seeing(self, reflected: "mi.Color3f", landings: Landings) -> "Gatherer":
         """The same for other values of ρ H, and where that light is."""
@@ -91,7 +93,7 @@ class Gatherer:
         """
         model, patches = self._model, self._model.patches
         origin = places.x + patches.origin + places.normal * patches.lift
-        hit = model.rays.follow(origin, direction, number, seed, active=active)
+        hit = model.rays.follow(origin, direction, number, seed, active=active, highlights=self.highlights)
         met = active & (hit.patch != NONE)
         H = self._looked_up(hit, met)
         emission = model.lights.at(patches, hit.patch, hit.u, hit.v, met)
@@ -103,7 +105,7 @@ class Gatherer:
         lamp += self._sky(places, direction, active & ~hit.valid & ~hit.bounced, rays_per_line)
         seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
         seen += model.lights.sky(hit.direction, active & ~hit.valid & hit.bounced)
-        return dr.select(active, hit.glow + hit.weight * (H + seen), 0), lamp
+        return dr.select(active, hit.glow + hit.weight * (H + seen * hit.share), 0), lamp
 
     def _sky(self, places, direction, escaped, rays_per_line):
         """H from the sky that rays meet which go straight there, as far as lines do not find it (Color3f [n])."""

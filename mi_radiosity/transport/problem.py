@@ -48,7 +48,7 @@ class Flow:
 
     Irradiances are Color3f [elements]: right at the leaves, area averages at their ancestors. ``direct`` came straight
     from the lamps, ``indirect`` is all other light. ``caustic`` is the part of it that only shooting finds: light of
-    lamps that no ray can meet, such as `point`, which came through lobes that are traced (None where there is none).
+    lamps that no ray can meet, such as `point`, which came through smooth lobes first (None where there is none).
     """
 
     direct: "mi.Color3f"

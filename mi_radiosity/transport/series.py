@@ -185,9 +185,10 @@ class _Series:
         # Rays that start inside a solid go nowhere; the others of their element carry their power.
         goes = ~batch.doubtful | on_patch | ~hit.valid | hit.traced
         tally.add(batch, hit, receiver, batch.starts & goes)
-        for part, through in ((direct, False), (focused, True)):
-            if part is not None:
-                part.add(batch, hit, receiver, batch.starts & goes & (hit.bounced == through))
+        if direct is not None:
+            direct.add(batch, hit, receiver, batch.starts & goes & ~hit.bounced)
+        if focused is not None:
+            focused.add(batch, hit, receiver, batch.starts & goes & hit.bounced & ~hit.rough)
         if self.how.records:
             met = dr.select(straight(batch, hit), hit.patch, NONE)
             record = Record(met, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)

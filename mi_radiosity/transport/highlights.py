@@ -1,0 +1,71 @@
+"""Lamps as rough lobes see them: by lines to them, and by the lobes' own rays, weighed by the balance heuristic."""
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.arrays import NONE
+from ..core.points import triangle
+from ..scene import Model
+from ..scene.rays import Hit
+from .lamps import LampChoice
+
+
+class Highlights:
+    """What rays that follow lobes ask for at surfaces that are rough and have no diffuse lobe.
+
+    One line to a lamp that is a surface, drawn by power, and one to each of the others (Veach 1997, eq. 9.8).
+    """
+
+    def __init__(self, model: Model, lamps: LampChoice) -> None:
+        self._model, self._lamps = model, lamps
+
+    def light(
+        self,
+        ctx: "mi.BSDFContext",
+        bsdf: "mi.BSDFPtr",
+        si: "mi.SurfaceInteraction3f",
+        random: "mi.PCG32",
+        active: "mi.Bool",
+    ) -> "mi.Color3f":
+        """π L that lobes send on of the lamps, as lines find it, W/m² (Color3f [n])."""
+        rays, patches, lights = self._model.rays, self._model.patches, self._model.lights
+        total = mi.Color3f(0)
+
+        def add(direction, distance, light, density, on):
+            """What becomes of light π L, over its density, from so far along a direction."""
+            value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(direction), on)
+            on &= (dr.max(value) > 0) & dr.isfinite(pdf)
+            on &= ~rays.scene.ray_test(si.spawn_ray_to(si.p + direction * distance), active=on)
+            weight = dr.select(density > 0, density / (density + pdf), 1)
+            return dr.select(on, value * light * weight, 0)
+
+        if self._lamps.count:
+            lamp, density = self._lamps.draw(random.next_float32())
+            u, v = triangle(random.next_float32(), random.next_float32())
+            d = patches.point(lamp, u, v) + patches.origin - si.p
+            distance = dr.norm(d)
+            cosine = -dr.dot(dr.gather(mi.Vector3f, patches.normal, lamp), d) / distance
+            on = active & (cosine > 0) & rays.on_top(lamp, u, v)
+            density = dr.select(on, density * dr.square(distance) / cosine, 1)
+            total += add(d / distance, distance, lights.at(patches, lamp, u, v, on) / density, density, on)
+        for lamp in lights.free:
+            direction, distance, irradiance = lamp.sample(si.p, random.next_float32(), random.next_float32())
+            on = active & (dr.max(irradiance) > 0)
+            total += add(direction, distance, dr.pi * irradiance, lamp.density(direction), on)
+        return total
+
+    def density(self, x: "mi.Point3f", direction: "mi.Vector3f", hit: Hit) -> "mi.Float":
+        """Density over directions, 1/sr, of the lines that find what rays from x have met: lamps, or the sky."""
+        patches, sky = self._model.patches, self._model.lights.sky_light
+        density = mi.Float(0)
+        if self._lamps.count:
+            met = hit.valid & (hit.patch != NONE)
+            patch = dr.select(met, hit.patch, 0)
+            d = patches.point(patch, hit.u, hit.v) + patches.origin - x
+            cosine = -dr.dot(dr.gather(mi.Vector3f, patches.normal, patch), direction)
+            found = met & (cosine > 0)
+            of_area = self._lamps.density(patch, None, found)
+            density = dr.select(found, of_area * dr.squared_norm(d) / cosine, 0)
+        if sky is not None:
+            density = dr.select(hit.valid, density, sky.density(direction))
+        return density
