@@ -31,6 +31,7 @@ class Stream(IntEnum):
     PIXELS = 9  # camera samples
     LOBES = 8  # what lobes rays draw on their way
     FACTORS = 10  # rays and lines that view factors are made of
+    SIGHT = 11  # points of leaves that walls cross, from which their light is looked for
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

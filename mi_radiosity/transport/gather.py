@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE
-from ..core.points import triangle
+from ..core.arrays import NONE, opaque_index
+from ..core.points import Stream, kronecker, stream_seed, triangle
 from ..mesh import Elements, Exposure
 from ..scene import Model
 from .highlights import Highlights
 from .lamps import LampChoice
 from .landings import Landings
+
+LOOKS = 32  # points of a crossed leaf
 
 
 @dataclass
@@ -37,7 +39,8 @@ class Gatherer:
         self, model: Model, elements: Elements, exposure: Exposure, landings: Landings, reflected: "mi.Color3f"
     ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
-        self._exposure, self._landings = exposure, landings
+        self._exposure = exposure
+        self._place(landings)
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
         self.highlights = Highlights(model, self._lamps) if model.rays.glossy else None
@@ -45,8 +48,31 @@ class Gatherer:
     def seeing(self, reflected: "mi.Color3f", landings: Landings) -> "Gatherer":
         """The same for other values of ρ H, and where that light is."""
         other = copy.copy(self)
-        other._reflected, other._landings = reflected, landings
+        other._reflected = reflected
+        other._place(landings)
         return other
+
+    def _place(self, landings):
+        """Look how much of each crossed leaf is in sight of where its light came down: all of its light is there."""
+        self._landings = landings
+        if landings.slots == 0:
+            return
+        e, rays = self._elements, self._model.rays
+        leaves = dr.gather(
+            mi.UInt32, e.leaves, dr.compress(dr.gather(mi.UInt32, self._exposure.slot, e.leaves) != NONE)
+        )
+        k = dr.arange(mi.UInt32, dr.width(leaves) * LOOKS)
+        leaf, number = dr.gather(mi.UInt32, leaves, k // LOOKS), k % LOOKS
+        slot, patch = dr.gather(mi.UInt32, self._exposure.slot, leaf), dr.gather(mi.UInt32, e.patch, leaf)
+        x0, x1, _, _ = kronecker(number, e.key(leaves), opaque_index(stream_seed(0, Stream.SIGHT)), k // LOOKS)
+        u, v = e.patch_point(leaf, *triangle(x0, x1))
+        asked = landings.any_on(slot, True) & rays.on_top(patch, u, v)
+        seen = landings.in_sight(e, rays, leaf, slot, e.patches.above(patch, u, v), asked)
+        share = dr.block_sum(dr.select(seen, mi.Float(1 / LOOKS), 0), LOOKS)
+        self._bright = dr.zeros(mi.Float, landings.slots)
+        more = self._exposure.open_share(e, leaves) / dr.maximum(share, 2 / LOOKS)
+        dr.scatter(self._bright, more, dr.gather(mi.UInt32, self._exposure.slot, leaves))
+        dr.eval(self._bright)
 
     def lines(
         self,
@@ -116,7 +142,7 @@ class Gatherer:
         return lights.sky(direction, escaped) * share
 
     def _looked_up(self, hit, met):
-        """ρ H where rays end, 0 behind walls that keep the light of their leaf from them (Color3f [n])."""
+        """ρ H where rays end; of leaves that walls cross, all of it on the side their light is on (Color3f [n])."""
         e = self._elements
         leaf = e.leaf_at(hit.patch, hit.u, hit.v, met)
         H = dr.gather(mi.Color3f, self._reflected, leaf, met)
@@ -126,7 +152,8 @@ class Gatherer:
         crossed = met & (slot != NONE)
         landed = self._landings.any_on(slot, crossed)
         x = e.patches.above(dr.select(met, hit.patch, 0), hit.u, hit.v)
-        return dr.select(crossed & ~self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed), 0, H)
+        seen = self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed)
+        return H * dr.select(crossed, dr.select(seen, dr.gather(mi.Float, self._bright, slot, crossed), 0), 1)
 
     def _share_of_rays(self, places, hit, met, rays_per_line):
         """The balance heuristic's weight of rays that meet lamps, c F / (p + c F) (Float [n])."""

@@ -77,7 +77,7 @@ class _Pass:
         bound = [1e5 * self._most_from_lamps() * int(self._lines.max())] * 3
         self._direct, self._alone = (ColorSums(dr.width(e.leaves), bound) for _ in range(2))
         self._landings = Landings(exposure.slots)
-        self._gatherer = Gatherer(model, e, exposure, self._landings, dr.zeros(mi.Color3f, len(e)))
+        self._gatherer = Gatherer(model, e, exposure, Landings(0), dr.zeros(mi.Color3f, len(e)))
         self._sample_all(1, self._alone)
         return Known(self._seen(), self._landings.settled())
 

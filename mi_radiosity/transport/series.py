@@ -49,13 +49,15 @@ class Shooting(Transport):
     is lost however large ρ is. Where the light straight from the lamps is `Known`, their rays only find how much of it
     there is in all, and what comes through lobes; a few do.
 
-    tail: share of the power below which the rest is summed in closed form. even: share of the rays that leaves get
+    tail: share of the power below which the rest is summed in closed form, once an iteration brings the mean leaf less
+    than the share ``late`` of its light. even: share of the rays that leaves get
     however little power they have: a room that is lit through a window has little of all. numbering: which points rays
     have. deposit: who receives their power. records: keep the rays, to discover pairs with.
     Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
     """
 
-    tail: float = 0.0001  # little of the sun comes into a room, and is not to end with what stays outside
+    tail: float = 0.0001
+    late: float = 0.005  # little of the sun comes into a room, and is not to end with what stays outside
     even: float = 0.25
     numbering: Callable = numbered_through
     deposit: Callable = trusted
@@ -75,7 +77,7 @@ class Shooting(Transport):
         return series.flow()
 
 
-PILOT = Shooting(tail=0.1, even=0, numbering=numbered_by_leaf, deposit=spread, records=True)
+PILOT = Shooting(tail=0.1, late=1, even=0, numbering=numbered_by_leaf, deposit=spread, records=True)
 
 
 class _Series:
@@ -96,12 +98,13 @@ class _Series:
         self.traces = problem.model.rays.lobes is not None
         self.focuses = self.traces and any(not light.is_sky for light in problem.model.lights.free)
         self.share, self.left, self.shot, self.iteration = first_share, rays, 0.0, 0
+        self.late = 1.0  # of the light of the mean leaf, what the last iteration brought
         self.landings, self.all_landings = None, Landings(problem.exposure.slots)
         self.records: list[Record] = []
 
     def iterate(self, progress):
         """Shoot what is unshot; what is reflected of it becomes the unshot power of the next iteration."""
-        little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted)
+        little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted) and self.late <= self.how.late
         last = self.iteration > 0 and (self.iteration == ITERATIONS - 1 or little)
         share = self.share * (GLANCE if self.iteration == 0 and self.problem.known and not self.traces else 1)
         count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * share)))
@@ -123,6 +126,11 @@ class _Series:
             self.indirect = [i - h for i, h in zip(self.indirect, self.direct)]
             self.caustic = self.caustic if focused is None else self._received(focused, scale)
         dr.eval(self.direct, self.indirect, self.power)
+        if self.how.late < 1:
+            brought, before = (
+                h[0] + h[1] + h[2] for h in (received, [d + i for d, i in zip(self.direct, self.indirect)])
+            )
+            self.late = dr.mean(dr.select(before > 0, brought / before, 0))[0]
         bins = (self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED), (self.blocked, Tally.TAKEN)
         for lost, which in bins:
             lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
