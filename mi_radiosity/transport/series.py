@@ -130,7 +130,7 @@ class _Series:
             brought, before = (
                 h[0] + h[1] + h[2] for h in (received, [d + i for d, i in zip(self.direct, self.indirect)])
             )
-            self.late = dr.mean(dr.select(before > 0, brought / before, 0))[0]
+            self.late = totals([dr.select(before > 0, brought / before, 0)])[0] / dr.width(before)
         bins = (self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED), (self.blocked, Tally.TAKEN)
         for lost, which in bins:
             lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
