@@ -3,12 +3,23 @@
 import argparse
 import json
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .core.console import PROGRAM, Report, choose_views, positive, progress_bars, shading_argument, view_name, warn
+from .core.console import (
+    PROGRAM,
+    Report,
+    choose_views,
+    positive,
+    positive_number,
+    progress_bars,
+    shading_argument,
+    view_name,
+    warn,
+)
 from .core.errors import RadiosityError, interruptible
 from .core.files import check_writable, writing
 from .evaluation.commands import add_evaluation
@@ -24,6 +35,7 @@ if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     from .solver import Solution
     from .solver.cost import Cost
 
+SOLVING_SHARE = 0.3  # of --seconds; more for the solve, or less, was worse (docs/pictures.md)
 SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed", "layers")
 
 
@@ -110,7 +122,9 @@ def _render_arguments(parser):
     add("-o", "--output", required=True, type=Path, metavar="OUT.exr|.png", help=names)
     _solve_arguments(parser.add_argument_group("solution"))
     add("--view", default="0", metavar="K|all", help="sensor number, or all (default 0)")
-    add("--spp", type=positive, default=64, metavar="N", help="camera samples per pixel (default 64)")
+    add("--spp", type=positive, metavar="N", help="camera samples per pixel (default 64)")
+    within = "as good as it gets in T seconds, solve and pictures together; the file gets better all the time"
+    add("--seconds", type=positive_number, metavar="T", help=within)
     shading_argument(parser, "gather")
     add("--denoise", action="store_true", help="remove the noise of the samples (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
@@ -158,12 +172,20 @@ def _render(arguments: argparse.Namespace) -> None:
     scene = arguments.file.load()
     views = choose_views(scene, arguments.view)
     with progress_bars() as report:
+        start = time.perf_counter()
+        if arguments.seconds and not arguments.load:
+            options["seconds"] = SOLVING_SHARE * arguments.seconds
         solution = _solution(arguments, scene, options, report)
         _keep(arguments, solution)
         for number, view in enumerate(views):
             report("render", number, len(views))
-            image = solution.render(view, arguments.spp, arguments.shading, denoise=arguments.denoise)
-            write_image(view_name(arguments.output, view, views), image, solution.stats)
+            path = view_name(arguments.output, view, views)
+            if arguments.seconds:
+                left = max(arguments.seconds - (time.perf_counter() - start), 1e-3) / (len(views) - number)
+                _grow(arguments, solution, view, path, left)
+            else:
+                image = solution.render(view, arguments.spp or 64, arguments.shading, denoise=arguments.denoise)
+                write_image(path, image, solution.stats)
             report("render", number + 1, len(views))
     shader: type[Shader] = SHADERS.find(arguments.shading)
     if legend := shader.legend(solution):
@@ -175,6 +197,29 @@ def _render(arguments: argparse.Namespace) -> None:
     )
 
 
+def _grow(arguments: argparse.Namespace, solution: "Solution", view: int, path: Path, seconds: float) -> None:
+    """Write ever better pictures of a view; the last one stays, whenever it ends."""
+    from .display import write_image
+
+    start, shown, least = time.perf_counter(), 0, 0.0
+
+    def show(image: "mi.TensorXf", samples: int) -> None:
+        nonlocal shown, least
+        now = time.perf_counter() - start
+        if now >= least or now > 0.5 * seconds:
+            before = time.perf_counter()
+            write_image(path, image, solution.stats | {"spp": samples})
+            shown, least = samples, now + 20 * (time.perf_counter() - before)
+
+    try:
+        image = solution.render(view, shading=arguments.shading, denoise=arguments.denoise, seconds=seconds, show=show)
+        write_image(path, image, solution.stats)
+    except KeyboardInterrupt:
+        if shown:
+            warn([f"interrupted: {path} has {shown} samples per pixel"])
+        raise
+
+
 def _solve_options(arguments: argparse.Namespace) -> dict[str, Any]:
     """What `solve` is asked for; names and combinations are checked here, before anything takes time."""
     from .oracles import make_oracle
@@ -182,6 +227,8 @@ def _solve_options(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.output.suffix.lower() not in (".exr", ".png"):
         raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .exr or .png")
     options = {name: value for name in SOLVING if (value := getattr(arguments, name)) is not None}
+    if arguments.seconds and arguments.spp:
+        raise RadiosityError("give either --spp or --seconds, not both")
     if arguments.load and options:
         raise RadiosityError(f"--load shows a finished solution: leave out --{next(iter(options))}")
     oracle = make_oracle(options.pop("oracle", "gmi"), options.pop("alpha", None))

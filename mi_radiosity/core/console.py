@@ -41,6 +41,17 @@ def positive(text: str) -> int:
     return value
 
 
+def positive_number(text: str) -> float:
+    """The number > 0 that an option is given."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number greater than 0")
+    return value
+
+
 def shading_argument(parser: argparse.ArgumentParser, default: str = "gouraud") -> None:
     """Add --shading; its name is checked when plugins have defined theirs."""
     names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"

@@ -17,22 +17,32 @@ def require_denoiser() -> Any:
     return optional("mitsuba_oidn", "denoising", "denoise")
 
 
-def denoised_picture(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable) -> "mi.TensorXf":
-    """A picture [height, width, 3] of ``spp`` samples per pixel of ``sample(scene, sampler, ray)``, denoised.
+class CleanPicture:
+    """A picture [height, width, 3] of ``sample(scene, sampler, ray)`` that takes more and more samples, denoised.
 
     Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals
     of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel.
     """
-    denoiser = require_denoiser()
-    width, height = (int(n) for n in sensor.film().crop_size())
-    if sensor.film().sample_border():
-        raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
-    sums = np.zeros((3, height * width, 3))
-    for points in passes(width * height, spp, seed):
-        sums += _sums(scene, sensor, points, sample)
-    color, albedo, normal = (np.ascontiguousarray(s.reshape(height, width, 3) / spp, np.float32) for s in sums)
-    clean = denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True, clean_aux=True)
-    return mi.TensorXf(_filtered(np.asarray(clean), sensor.film().rfilter()))
+
+    def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable) -> None:
+        self._denoiser, self._scene, self._sensor, self._sample = require_denoiser(), scene, sensor, sample
+        self._width, self._height = (int(n) for n in sensor.film().crop_size())
+        if sensor.film().sample_border():
+            raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
+        self._sums, self._count = np.zeros((3, self._height * self._width, 3)), 0
+
+    def add(self, spp: int, seed: int) -> None:
+        """Take ``spp`` more samples per pixel; another seed every time."""
+        for points in passes(self._width * self._height, spp, seed):
+            self._sums += _sums(self._scene, self._sensor, points, self._sample)
+        self._count += spp
+
+    def image(self) -> "mi.TensorXf":
+        """What has been sampled, without its noise."""
+        planes = (s.reshape(self._height, self._width, 3) / self._count for s in self._sums)
+        color, albedo, normal = (np.ascontiguousarray(plane, np.float32) for plane in planes)
+        clean = self._denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True, clean_aux=True)
+        return mi.TensorXf(_filtered(np.asarray(clean), self._sensor.film().rfilter()))
 
 
 def _sums(scene, sensor, points, sample):

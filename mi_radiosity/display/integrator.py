@@ -1,5 +1,6 @@
 """The `radiosity` integrator: any sensor looks at a solution through Mitsuba's own film."""
 
+import time
 from typing import Any
 
 import drjit as dr
@@ -11,8 +12,8 @@ from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import Solution, solve
-from .denoise import denoised_picture
-from .pixels import picture
+from .denoise import CleanPicture
+from .pixels import FilmPicture, grow
 from .shaders import SHADERS, Look
 
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
@@ -67,23 +68,32 @@ def _integrator_class():
             self._display(solve(scene, **self.options, progress=self.progress), given=False)
             return self.solution
 
-        def picture(self, scene, sensor, seed, spp, denoise=False):
-            """What `mi.render` gives, of a sensor or its number; denoised if asked for."""
+        def picture(self, scene, sensor, seed, spp, denoise=False, seconds=None, show=None):
+            """What `mi.render` gives, of a sensor or its number; denoised, or as good as ``seconds`` make it, if asked
+            for."""
             if isinstance(sensor, int):
                 count = len(scene.sensors())
                 if not 0 <= sensor < count:
                     raise RadiosityError(f"there is no sensor {sensor}: the scene has {count}, counted from 0")
                 sensor = scene.sensors()[sensor]
-            if denoise:
-                self.prepare(scene)
-                return denoised_picture(scene, sensor, spp, seed, self._sample)
-            return self.render(scene, sensor, seed=seed, spp=spp)
+            if seconds is None and not denoise:
+                return self.render(scene, sensor, seed=seed, spp=spp)
+            start = time.perf_counter()
+            self.prepare(scene)
+            picture = (CleanPicture if denoise else FilmPicture)(scene, sensor, self._sample)
+            if seconds is None:
+                picture.add(spp, seed)
+            else:
+                grow(picture, seed, seconds - (time.perf_counter() - start), show or (lambda image, samples: None))
+            return picture.image()
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             seed = int(seed[0] if dr.is_array_v(seed) else seed)
-            return picture(scene, chosen, spp or chosen.sampler().sample_count(), seed, self._sample, develop)
+            picture = FilmPicture(scene, chosen, self._sample)
+            picture.add(spp or chosen.sampler().sample_count(), seed)
+            return picture.image() if develop else None
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             raise RadiosityError(NO_GRADIENTS)

@@ -1,6 +1,8 @@
 """Camera samples: well spread over pixels, lenses, lamps and directions, and unbiased."""
 
+import time
 from collections.abc import Callable, Iterator
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -53,22 +55,67 @@ def passes(pixels: int, spp: int, seed: int) -> Iterator[PixelPoints]:
         yield PixelPoints(pixels, first, min(most, spp - first), spp, seed)
 
 
-def picture(
-    scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int, sample: Callable, develop: bool = True
-) -> "mi.TensorXf | None":
-    """The film of a sensor after ``spp`` samples per pixel of ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
-    from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
+class FilmPicture:
+    """A picture on the film of a sensor that takes more and more camera samples of
+    ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
 
-    film = sensor.film()
-    film.prepare([])
-    size = film.crop_size() + (2 * film.rfilter().border_size() if film.sample_border() else 0)
-    for sampler in passes(int(dr.prod(size)), spp, seed):
-        ray, weight, position = ADIntegrator.sample_rays(None, scene, sensor, sampler)
-        radiance, valid, _ = sample(scene, sampler, ray)
-        block = film.create_block()
-        block.set_coalesce(block.coalesce() and sampler.sample_count() >= 4)
-        alpha = dr.select(valid, mi.Float(1), mi.Float(0))
-        ADIntegrator._splat_to_block(block, film, position, radiance * weight, 1.0, alpha, [], ray.wavelengths)
-        film.put_block(block)
-        dr.eval(block.tensor())
-    return film.develop() if develop else None
+    def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable) -> None:
+        self._scene, self._sensor, self._sample, self._film = scene, sensor, sample, sensor.film()
+        self._film.prepare([])
+        border = 2 * self._film.rfilter().border_size() if self._film.sample_border() else 0
+        self._pixels = int(dr.prod(self._film.crop_size() + border))
+
+    def add(self, spp: int, seed: int) -> None:
+        """Take ``spp`` more samples per pixel; another seed every time."""
+        from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
+
+        for sampler in passes(self._pixels, spp, seed):
+            ray, weight, position = ADIntegrator.sample_rays(None, self._scene, self._sensor, sampler)
+            radiance, valid, _ = self._sample(self._scene, sampler, ray)
+            block = self._film.create_block()
+            block.set_coalesce(block.coalesce() and sampler.sample_count() >= 4)
+            alpha = dr.select(valid, mi.Float(1), mi.Float(0))
+            ADIntegrator._splat_to_block(
+                block, self._film, position, radiance * weight, 1.0, alpha, [], ray.wavelengths
+            )
+            self._film.put_block(block)
+            dr.eval(block.tensor())
+
+    def image(self) -> "mi.TensorXf":
+        """What the film holds now [height, width, channels]."""
+        return self._film.develop()
+
+
+class Growing(Protocol):
+    """A FilmPicture, or one that is denoised."""
+
+    def add(self, spp: int, seed: int) -> None: ...
+
+    def image(self) -> "mi.TensorXf": ...
+
+
+def grow(picture: Growing, seed: int, seconds: float, show: Callable[["mi.TensorXf", int], None]) -> int:
+    """Take samples until ``seconds`` are over, in passes that double as far as they fit; returns how many per pixel.
+
+    show(image, samples) is told of a better picture after every pass. At least one sample is taken; what a pass takes
+    is judged by those before.
+    """
+    start, done, spp, number, speed = time.perf_counter(), 0, 1, 0, 0.0
+    while True:
+        before = time.perf_counter()
+        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + number))
+        image = picture.image()
+        dr.eval(image)
+        dr.sync_thread()
+        now = time.perf_counter()
+        done, number = done + spp, number + 1
+        show(image, done)
+        left = seconds - (time.perf_counter() - start)
+        # The first passes compile, and have less to say of what the next ones take.
+        speed = (now - before) / spp if number < 3 else max((now - before) / spp, 0.9 * speed)
+        fits = int(left / max(speed, 1e-9))
+        if fits < 1:
+            return done
+        spp = min(2 * spp, fits) if number > 1 else 1
+        if fits < 2 * spp:  # rather one pass of all that fits than a small one at the end
+            spp = fits

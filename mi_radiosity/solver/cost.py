@@ -7,11 +7,15 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import opaque_index
+from ..core.errors import RadiosityError
 from ..core.points import kronecker, triangle
 from ..scene import Model
 from ..transport.emit import AT_ONCE
-from .solve import default_rays, wanted_elements
 
+ELEMENTS = 19_000  # default mesh: so many leaves more than patches
+RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
+MOST = 4  # times the default rays: more add less to a picture than camera samples do
+FEWEST = 1 / 32  # of the default elements and rays
 PROBES = 1 << 19  # rays that are timed
 # Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY = 110e6, 2.5e3, 4e3, 24
@@ -44,11 +48,42 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     return Cost(count, rays, memory, ray * (WORK * rays + LINES * more))
 
 
+def default_rays(elements: int) -> int:
+    """The ray budget of so many leaf elements where none is given."""
+    return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
+
+
+def wanted_elements(model: Model, elements: int | None, epsilon: float | None) -> int | None:
+    """Leaves to refine to, or None where ε decides."""
+    count = model.patches.count
+    if epsilon is not None:
+        return None
+    if elements is None:
+        return count + ELEMENTS
+    if elements < count:
+        raise RadiosityError(
+            f"the scene has {count} patches, so {elements} elements cannot be reached: "
+            f"ask for at least {count} elements"
+        )
+    return elements
+
+
+def afford(model: Model, seconds: float, elements: int | None = None, rays: int | None = None) -> tuple[int, int]:
+    """Elements and rays, where they are not given, that a solve of about so many seconds has.
+
+    Both go with the time, up to the default elements and MOST times the default rays.
+    """
+    usual = estimate_cost(model, elements, rays)
+    share = min(max(seconds / max(usual.seconds, 1e-9), FEWEST), MOST)
+    count = elements or model.patches.count + round(ELEMENTS * min(share, 1))
+    return count, rays or round(share * usual.rays)
+
+
 def _trace(model):
-    """Trace cosine-distributed rays from all over the scene."""
+    """Trace cosine-distributed rays from all over the scene, neighbours after neighbours as a solve does."""
     n = dr.arange(mi.UInt32, PROBES)
     u, v, s, t = kronecker(n, opaque_index(0), opaque_index(0))
-    patch = n % opaque_index(model.patches.count)
+    patch = mi.UInt32((mi.UInt64(n) * mi.UInt64(opaque_index(model.patches.count))) // PROBES)
     hit = model.rays.follow(*model.rays.leave(patch, *triangle(u, v), s, t), n, opaque_index(0))
     dr.eval(hit.patch, hit.u)
     dr.sync_thread()

@@ -13,13 +13,12 @@ from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Transport
+from .cost import afford, default_rays, wanted_elements
 from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
 
-ELEMENTS = 19_000  # default mesh: so many leaves more than patches
 FEW_RAYS = 30  # per element, below which a user is warned
-RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 
 
 @interruptible()
@@ -35,6 +34,7 @@ def solve(
     transport: Transport | None = None,
     pilot: Transport = PILOT,
     layers: bool = False,
+    seconds: float | None = None,
     progress: Callable[[str, int, int | None], None] | None = None,
 ) -> Solution:
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
@@ -47,19 +47,24 @@ def solve(
     lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
     default, while `Shooting()` shoots it only. layers: keep the light of every lamp by itself, for `Solution.relight`;
-    the rays are shared out by the lamps' power. progress: called with (stage, done, total), stage being "refine" or
+    the rays are shared out by the lamps' power. seconds: choose elements and rays, where they are not given, so that it
+    takes about so long, reading the scene and all; from then on more of them would go into pictures with more profit
+    (see `afford`). progress: called with (stage, done, total), stage being "refine" or
     "distribute" (total is None where it is not known).
 
     Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements. Raises RadiosityError for
     options and scenes that cannot be used.
     """
     oracle, transport = oracle or GMI(0.5), transport or Gathering()
-    _check(oracle, elements, epsilon, rays, lines)
+    _check(oracle, elements, epsilon, rays, lines, seconds)
     report, clock = progress or (lambda stage, done, total: None), _Clock()
 
     model = scene if isinstance(scene, Model) else Model(scene)
-    wanted = wanted_elements(model, elements, epsilon)
     clock.lap("scene")
+    given = elements is not None
+    if seconds is not None:
+        elements, rays = afford(model, seconds - clock.total(), elements if epsilon is None else None, rays)
+    wanted = wanted_elements(model, elements if epsilon is None else None, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
@@ -72,7 +77,7 @@ def solve(
         epsilon,
         seed,
         lambda done: report("refine", done, wanted),
-        elements is not None,
+        given,
     )
     refinement.run()
     mesh = tree.freeze()
@@ -121,7 +126,7 @@ def solve(
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
 
-def _check(oracle, elements, epsilon, rays, lines):
+def _check(oracle, elements, epsilon, rays, lines, seconds):
     """Refuse options that make no sense."""
     if not isinstance(oracle, Oracle):
         raise RadiosityError(
@@ -132,8 +137,9 @@ def _check(oracle, elements, epsilon, rays, lines):
     for name, value in (("elements", elements), ("rays", rays), ("lines", lines)):
         if value is not None and (value != int(value) or value <= 0):
             raise RadiosityError(f"{name} must be a whole number greater than 0, not {value}")
-    if epsilon is not None and not 0 < epsilon < float("inf"):
-        raise RadiosityError(f"epsilon must be a number greater than 0, not {epsilon}")
+    for name, value in (("epsilon", epsilon), ("seconds", seconds)):
+        if value is not None and not 0 < value < float("inf"):
+            raise RadiosityError(f"{name} must be a number greater than 0, not {value}")
 
 
 def _warnings(elements, rays, caustic):
@@ -151,26 +157,6 @@ def _warnings(elements, rays, caustic):
     return found
 
 
-def default_rays(elements: int) -> int:
-    """The ray budget of so many leaf elements where none is given."""
-    return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
-
-
-def wanted_elements(model: Model, elements: int | None, epsilon: float | None) -> int | None:
-    """Leaves to refine to, or None where ε decides."""
-    count = model.patches.count
-    if epsilon is not None:
-        return None
-    if elements is None:
-        return count + ELEMENTS
-    if elements < count:
-        raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: "
-            f"ask for at least {count} elements"
-        )
-    return elements
-
-
 class _Clock:
     """Seconds by stage."""
 
@@ -182,6 +168,10 @@ class _Clock:
         dr.sync_thread()
         now = time.perf_counter()
         self._stages[stage], self._last = now - self._last, now
+
+    def total(self):
+        """Seconds so far."""
+        return time.perf_counter() - self._start
 
     def seconds(self):
         return self._stages | {"total": self._last - self._start}
