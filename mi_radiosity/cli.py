@@ -4,7 +4,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,7 +35,6 @@ if TYPE_CHECKING:  # imported where they are used, so that --help is quick
     from .solver import Solution
     from .solver.cost import Cost
 
-SOLVING_SHARE = 0.3  # of --seconds; more for the solve, or less, was worse (docs/pictures.md)
 SOLVING = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed", "layers")
 
 
@@ -163,6 +162,7 @@ def _definition(text):
 
 def _render(arguments: argparse.Namespace) -> None:
     from .display import SHADERS, Shader, require_denoiser, write_image
+    from .solver import SOLVING_SHARE
 
     options = _solve_options(arguments)
     if arguments.denoise:
@@ -203,12 +203,12 @@ def _grow(arguments: argparse.Namespace, solution: "Solution", view: int, path: 
 
     start, shown, least = time.perf_counter(), 0, 0.0
 
-    def show(image: "mi.TensorXf", samples: int) -> None:
+    def show(image: "Callable[[], mi.TensorXf]", samples: int) -> None:
         nonlocal shown, least
         now = time.perf_counter() - start
-        if now >= least or now > 0.5 * seconds:
+        if now >= least:
             before = time.perf_counter()
-            write_image(path, image, solution.stats | {"spp": samples})
+            write_image(path, image(), solution.stats | {"spp": samples})
             shown, least = samples, now + 20 * (time.perf_counter() - before)
 
     try:

@@ -1,7 +1,7 @@
 """Radiosity shown: shadings by name, and the `radiosity` integrator."""
 
 from ..solver import Field
-from .denoise import require_denoiser
+from .denoise import CleanPicture, require_denoiser
 from .image import write_image
 from .integrator import register, render
 from .lux import Lux, lux_scale
@@ -9,6 +9,7 @@ from .shaders import SHADERS, Flat, Gouraud, Look, Shader
 
 __all__ = [
     "SHADERS",
+    "CleanPicture",
     "Field",
     "Flat",
     "Gouraud",

@@ -94,26 +94,24 @@ class Growing(Protocol):
     def image(self) -> "mi.TensorXf": ...
 
 
-def grow(picture: Growing, seed: int, seconds: float, show: Callable[["mi.TensorXf", int], None]) -> int:
+def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, int], None]) -> int:
     """Take samples until ``seconds`` are over, in passes that double as far as they fit; returns how many per pixel.
 
-    show(image, samples) is told of a better picture after every pass. At least one sample is taken; what a pass takes
-    is judged by those before.
+    show(image, samples) is told after every pass; image() is the picture then. At least one sample is taken; what a
+    pass takes is judged by those before.
     """
     start, done, spp, number, speed = time.perf_counter(), 0, 1, 0, 0.0
     while True:
         before = time.perf_counter()
         picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + number))
-        image = picture.image()
-        dr.eval(image)
         dr.sync_thread()
         now = time.perf_counter()
         done, number = done + spp, number + 1
-        show(image, done)
+        show(picture.image, done)
         left = seconds - (time.perf_counter() - start)
         # The first passes compile, and have less to say of what the next ones take.
         speed = (now - before) / spp if number < 3 else max((now - before) / spp, 0.9 * speed)
-        fits = int(left / max(speed, 1e-9))
+        fits = int(0.95 * left / max(speed, 1e-9))
         if fits < 1:
             return done
         spp = min(2 * spp, fits) if number > 1 else 1

@@ -34,6 +34,7 @@ class Shader:
     `Solution.render` know it from then on, and defines `irradiance`, or `radiance` itself."""
 
     name = ""
+    samples = False  # is more light gathered for every camera sample, so that pictures get better with time?
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -116,6 +117,7 @@ class Gather(Shader):
     importance. As sharp as path tracing, whose paths it ends at their second diffuse lobe."""
 
     name = "gather"
+    samples = True
 
     def __init__(self, solution: Solution) -> None:
         super().__init__(solution)

@@ -1,5 +1,6 @@
 """Error against wall time: ours, `path`, and `path` with a denoiser, measured in one run."""
 
+import importlib.util
 import json
 import math
 import time
@@ -13,9 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..display import SHADERS
+from ..display import SHADERS, CleanPicture
 from ..scene import Model
-from ..solver import solve
+from ..solver import SOLVING_SHARE, solve
 from . import require_extra
 from .metrics import compare
 from .plots import error_against_time
@@ -27,6 +28,7 @@ from .speed import measure
 LADDER = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 2, 4)  # of the budgets given
 PATH_SPP = (1, 4, 16, 64, 256, 1024)
 VIEWS = 16
+TIMES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds of the shadings that sample
 OUR_SPP = 16  # camera samples per pixel of our pictures
 SWEEP = 45  # degrees the camera path turns through
 
@@ -63,13 +65,15 @@ def run_bench(
     path_spp: Sequence[int] = PATH_SPP,
     views: int = VIEWS,
     runs: int = 5,
+    times: Sequence[float] = TIMES,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> dict[str, Any]:
     """Write bench.json and error_time.png of a scene file into ``output``; returns the results.
 
-    Ours is solve + pictures for a ladder of budgets with kernels warm. ``path`` runs at 1…1024 samples
-    per pixel; the denoiser, where mitsuba-oidn is installed, gets albedo and normals too. The camera
-    path turns the first sensor about its place, at half the resolution and a quarter of the samples.
+    Ours is reading, solve and pictures, with kernels warm: for a ladder of budgets, or, in a shading that samples, of
+    times, denoised and not. ``path`` runs at 1…1024 samples per pixel; Open Image Denoise, where it is installed, gets
+    box-filtered pixels, albedo and normals of both, and the film's filter comes afterwards. The camera path turns the
+    first sensor about its place, at half the resolution and a quarter of the samples.
     """
     require_extra()
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
@@ -91,10 +95,10 @@ def run_bench(
     }
     attempts = partial(_attempts, model, elements, rays, shading)
     one = Views([model.scene.sensors()[view]], [reference.halves()])
-    results["one"] = _curves(attempts(path_spp), one, partial(progress, "measuring one view"))
-    if many := _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress):
+    results["one"] = _curves(attempts(path_spp, times), one, partial(progress, "measuring one view"))
+    if views > 1 and (many := _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress)):
         fewer = [s for s in path_spp if s <= max(path_spp[-1] // 16, path_spp[0])]
-        results["many"] = _curves(attempts(fewer), many, partial(progress, f"measuring {views} views"))
+        results["many"] = _curves(attempts(fewer, times), many, partial(progress, f"measuring {views} views"))
     write(output / "bench.json", json.dumps(results, indent=1) + "\n")
     write(output / "error_time.png", error_against_time(results))
     return results
@@ -104,14 +108,20 @@ def run_bench(
 
 
 def _attempts(
-    model: Model, elements: int, rays: int, shading: str, path_spp: Sequence[int]
-) -> dict[str, list[Callable[[list["mi.Sensor"]], tuple[list[np.ndarray], dict[str, Any]]]]]:
+    model: Model, elements: int, rays: int, shading: str, path_spp: Sequence[int], times: Sequence[float]
+) -> dict[str, list[Any]]:
     """By curve: what takes sensors and returns their pictures, and what else is known of them."""
-    ladder = [(max(model.patches.count, round(elements * f)), round(rays * f)) for f in LADDER]
-    tracers = {"path": path_image} | ({"denoised": denoise} if (denoise := _denoiser()) else {})
-    return {"ours": [partial(_solved, model, shading, *budget) for budget in ladder]} | {
-        curve: [partial(_traced, trace, model.scene, spp) for spp in path_spp] for curve, trace in tracers.items()
-    }
+    scene, cleans = model.scene, _denoiser_is_there()
+    tracers = {"path": path_image} | ({"denoised": _denoised_path} if cleans else {})
+    traced = {curve: [partial(_traced, trace, scene, spp) for spp in path_spp] for curve, trace in tracers.items()}
+    if not SHADERS.find(shading).samples:
+        ladder = [(max(model.patches.count, round(elements * f)), round(rays * f)) for f in LADDER]
+        return {"ours": [partial(_solved, scene, shading, *budget) for budget in ladder]} | traced
+    curves = {"ours": False} | ({"ours, denoised": True} if cleans else {})
+    return {
+        curve: [partial(_within, scene, shading, seconds, clean) for seconds in times]
+        for curve, clean in curves.items()
+    } | traced
 
 
 def _curves(attempts: dict[str, list[Callable]], views: Views, progress: Callable[[int, int], None]) -> dict[str, Any]:
@@ -126,8 +136,9 @@ def _curves(attempts: dict[str, list[Callable]], views: Views, progress: Callabl
             curves[curve].append(_timed(attempt, views))
             done += 1
             progress(done, total)
-    others = [curve for curve in curves if curve != "ours"]
-    return curves | {"crossing": {other: crossing(curves["ours"], curves[other]) for other in others}}
+    ours = {"denoised": curves.get("ours, denoised", curves["ours"])}
+    others = [curve for curve in curves if not curve.startswith("ours")]
+    return curves | {"crossing": {other: crossing(ours.get(other, curves["ours"]), curves[other]) for other in others}}
 
 
 def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
@@ -137,10 +148,26 @@ def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
     return {"seconds": _now() - start, **more, **views.error(images)}
 
 
-def _solved(model, shading, elements, rays, sensors):
+def _within(scene, shading, seconds, denoise, sensors):
+    """Our pictures after so many seconds in all, and what they are made of."""
+    start, samples = _now(), []
+    solution = solve(scene, seconds=SOLVING_SHARE * seconds)
+    more = {"elements": solution.stats["elements"], "rays": solution.stats["rays"], "solve_seconds": _now() - start}
+    images = []
+    for number, sensor in enumerate(sensors):
+        left, seen = max(seconds - (_now() - start), 1e-3) / (len(sensors) - number), [0]
+        picture = solution.render(
+            sensor, shading=shading, denoise=denoise, seconds=left, show=lambda _, spp, seen=seen: seen.append(spp)
+        )
+        images.append(np.array(picture)[..., :3])
+        samples.append(seen[-1])
+    return images, more | {"spp": float(np.mean(samples))}
+
+
+def _solved(scene, shading, elements, rays, sensors):
     """Our pictures, and what the solution took."""
     start = _now()
-    solution = solve(model, elements=elements, rays=rays)
+    solution = solve(scene, elements=elements, rays=rays)
     more = {"elements": solution.stats["elements"], "rays": rays, "solve_seconds": _now() - start}
     return [np.array(solution.render(s, spp=OUR_SPP, shading=shading))[..., :3] for s in sensors], more
 
@@ -155,21 +182,24 @@ def _now() -> float:
     return time.perf_counter()
 
 
-def _denoiser() -> Callable[["mi.Scene", "mi.Sensor", int], np.ndarray] | None:
-    """denoise(scene, sensor, spp) with albedo and normals, or None where mitsuba-oidn is not installed."""
-    try:
-        import mitsuba_oidn
-    except ImportError:
-        return None
+def _denoiser_is_there() -> bool:
+    return importlib.util.find_spec("mitsuba_oidn") is not None
 
-    def run(scene, sensor, spp):
-        color = path_image(scene, sensor, spp)
-        features = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-        planes = np.array(mi.render(scene, sensor=sensor, integrator=features, spp=min(spp, 16), seed=spp))
-        albedo, normal = np.ascontiguousarray(np.split(planes[..., -6:], 2, axis=2), dtype=np.float32)
-        return np.array(mitsuba_oidn.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, hdr=True))
 
-    return run
+def _denoised_path(scene, sensor, spp):
+    """A picture by `path`, denoised as ours are."""
+    integrator = mi.load_dict({"type": "path", "max_depth": -1})
+
+    def draw(pixels, spp, seed):
+        for first in range(0, spp, most := max(1, (1 << 23) // pixels)):
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.set_sample_count(count := min(most, spp - first))
+            sampler.seed(seed + first, pixels * count)
+            yield sampler
+
+    picture = CleanPicture(scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), draw)
+    picture.add(spp, seed=spp)
+    return np.array(picture.image())
 
 
 def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:

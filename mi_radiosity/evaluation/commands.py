@@ -63,7 +63,7 @@ def _bench_arguments(parser):
     add = parser.add_argument
     _budget_arguments(parser, "middle of the ladder of budgets", "bench.json and error_time.png")
     add("--view", default="0", metavar="K")
-    add("--views", type=positive, default=16, metavar="N", help="views of the camera path (default 16)")
+    add("--views", type=positive, default=16, metavar="N", help="views of the camera path (default 16; 1: none)")
     most = "most samples per pixel of path (default 1024)"
     add("--path-spp", type=positive, default=1024, metavar="N", help=most)
 

@@ -12,7 +12,12 @@ from ..core.color import srgb
 from .records import picture_file
 
 ROWS_OF_FIGURE = ("ks", "mi", "gmi:0.5")  # Fig. 1: KS, GMI_1, GMI_0.5
-CURVES = {"ours": "radiosity", "path": "path", "denoised": "path + Open Image Denoise"}
+CURVES = {
+    "ours": "radiosity",
+    "ours, denoised": "radiosity + Open Image Denoise",
+    "path": "path",
+    "denoised": "path + Open Image Denoise",
+}
 MOST_ERROR = 40  # at the bright end of the heat maps
 
 

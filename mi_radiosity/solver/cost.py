@@ -14,6 +14,7 @@ from ..transport.emit import AT_ONCE
 
 ELEMENTS = 19_000  # default mesh: so many leaves more than patches
 RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
+SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
 PROBES = 1 << 19  # rays that are timed

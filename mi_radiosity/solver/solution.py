@@ -196,13 +196,14 @@ class Solution:
         seed: int = 0,
         denoise: bool = False,
         seconds: float | None = None,
-        show: "Callable[[mi.TensorXf, int], None] | None" = None,
+        show: "Callable[[Callable[[], mi.TensorXf], int], None] | None" = None,
     ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         shading: ``gather`` and ``direct`` gather light at every pixel, ``gouraud`` and ``flat`` show what was solved.
         denoise: remove the noise of the samples by Open Image Denoise (extra ``denoise``); the picture has 3 channels.
-        seconds: take as many samples as fit, instead of ``spp``; show(image, samples) is told of ever better pictures.
+        seconds: take as many samples as fit, instead of ``spp``; show(image, samples) is told after
+        every pass, image() being the picture then.
         Raises RadiosityError if the scene has been edited since it was solved.
         """
         if seconds is not None and not 0 < seconds < float("inf"):
