@@ -13,6 +13,7 @@ from .core.console import (
     PROGRAM,
     Report,
     choose_views,
+    loading_arguments,
     positive,
     positive_number,
     progress_bars,
@@ -85,35 +86,14 @@ def _parser() -> Parser:
 
 def _scene_arguments(parser):
     parser.add_argument("scene", type=Path, metavar="SCENE", help="Mitsuba XML file")
-    _loading_arguments(parser)
+    loading_arguments(parser)
 
 
 def _solution_arguments(parser):
     parser.add_argument("solution", type=Path, metavar="SOLUTION.npz", help="what render --save has kept")
     parser.add_argument("--scene", type=Path, metavar="SCENE", help="the scene's file, if it is not where it was")
-    _loading_arguments(parser)
+    loading_arguments(parser)
     parser.set_defaults(mode=None)  # as it was kept
-
-
-def _loading_arguments(parser):
-    add = parser.add_argument
-    add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
-    add(
-        "-D",
-        "--define",
-        type=_definition,
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="set a $KEY of the scene file",
-    )
-    add(
-        "--plugin",
-        action="append",
-        default=[],
-        metavar="MODULE|FILE.py",
-        help="Python code that defines oracles or shaders of your own; may be repeated",
-    )
 
 
 def _render_arguments(parser):
@@ -148,13 +128,6 @@ def _solve_arguments(group):
     add("--seed", type=int, metavar="K", help="random seed (default 0)")
     layers = "keep the light of every lamp by itself, to dim and colour it later: see view"
     add("--layers", action="store_true", default=None, help=layers)
-
-
-def _definition(text):
-    key, equals, value = text.partition("=")
-    if not equals or not key:
-        raise argparse.ArgumentTypeError(f"write '{text}' as KEY=VALUE")
-    return key, value
 
 
 # ---- Commands --------------------------------------------------------------------------------------
@@ -315,7 +288,8 @@ def _prepare(arguments: argparse.Namespace) -> None:
 
     mi.set_log_level(mi.LogLevel.Error)
     recall_scene(arguments)
-    arguments.file = scene_file(arguments.scene, arguments.mode, dict(arguments.define), arguments.plugin)
+    path = arguments.scene[0] if isinstance(arguments.scene, list) else arguments.scene
+    arguments.file = scene_file(path, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
     if "shading" in arguments:
         SHADERS.find(arguments.shading)

@@ -52,6 +52,36 @@ def positive_number(text: str) -> float:
     return value
 
 
+def loading_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what says how a scene is loaded."""
+    add = parser.add_argument
+    add("-m", "--mode", default="llvm_ad_rgb", metavar="VARIANT", help="Mitsuba variant (default llvm_ad_rgb)")
+    add(
+        "-D",
+        "--define",
+        type=definition,
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="set a $KEY of the scene file",
+    )
+    add(
+        "--plugin",
+        action="append",
+        default=[],
+        metavar="MODULE|FILE.py",
+        help="Python code that defines oracles or shaders of your own; may be repeated",
+    )
+
+
+def definition(text: str) -> tuple[str, str]:
+    """The KEY and VALUE that an option is given."""
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise argparse.ArgumentTypeError(f"write '{text}' as KEY=VALUE")
+    return key, value
+
+
 def shading_argument(parser: argparse.ArgumentParser, default: str = "gouraud") -> None:
     """Add --shading; its name is checked when plugins have defined theirs."""
     names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"

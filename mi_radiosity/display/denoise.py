@@ -98,7 +98,10 @@ def _over_pixels(rfilter, reach):
         return np.array([float(rfilter.eval(float(y))[0]) for y in x])
 
     pixels, fine = np.arange(-reach, reach + 1), np.linspace(-reach - 0.5, reach + 0.5, 201)
-    weight, curve = at(pixels), at(fine)
-    weight, curve = weight / weight.sum(), curve / curve.sum()
-    share = (curve @ fine**2 - 1 / 12) / max(weight @ pixels**2, 1e-9)  # variances add up
-    return np.clip(share, 0, 1) * weight + (1 - np.clip(share, 0, 1)) * (pixels == 0)
+    curve = at(fine)
+    rest = max((curve @ fine**2) / curve.sum() - 1 / 12, 0)  # of the variance, beside that of a pixel
+    if rest <= 0.5:
+        return np.where(np.abs(pixels) == 1, rest / 2, np.where(pixels == 0, 1 - rest, 0.0))
+    weight = at(pixels) / at(pixels).sum()
+    share = min(rest / (weight @ pixels**2), 1)
+    return share * weight + (1 - share) * (pixels == 0)

@@ -6,7 +6,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.console import Report, choose_views, positive, progress_bars, shading_argument, view_name
+from ..core.console import (
+    Report,
+    choose_views,
+    loading_arguments,
+    positive,
+    positive_number,
+    progress_bars,
+    shading_argument,
+    view_name,
+)
 from ..core.errors import RadiosityError
 from ..core.files import check_writable
 
@@ -25,6 +34,9 @@ def add_evaluation(commands: Any, scene_arguments: Callable[[argparse.ArgumentPa
         scene_arguments(command)
         add(command)
         command.set_defaults(command=run)
+    gallery = commands.add_parser("gallery", help="a page of scenes: path, ours, and the difference")
+    _gallery_arguments(gallery)
+    gallery.set_defaults(command=_gallery)
 
 
 def _reference_arguments(parser):
@@ -88,6 +100,42 @@ def _reference(arguments: argparse.Namespace) -> None:
                 partial(report, stage),
             )
             print(f"{path}: {sum(result.spp)} samples per pixel, its own RMSE_a is {result.noise():.3f}")
+
+
+def _gallery_arguments(parser):
+    add = parser.add_argument
+    add("scene", type=Path, nargs="+", metavar="SCENE", help="Mitsuba XML files")
+    add("-o", "--output", required=True, type=Path, metavar="DIR", help="gallery.md, and pictures in gallery/")
+    add("--work", type=Path, default=Path("runs/gallery"), metavar="DIR", help="references (default runs/gallery)")
+    add("--seconds", type=positive_number, default=4.0, metavar="T", help="for ours (default 4)")
+    add("--reference-spp", type=positive, default=1024, metavar="N", help="samples per pixel of path (default 1024)")
+    add("--denoise", action="store_true", help="ours, by Open Image Denoise")
+    loading_arguments(parser)
+
+
+def _gallery(arguments: argparse.Namespace) -> None:
+    from ..display import require_denoiser
+    from .gallery import write_gallery
+    from .scenes import scene_file
+
+    if arguments.denoise:
+        require_denoiser()
+    definitions = dict(arguments.define)
+    files = [scene_file(path, arguments.mode, definitions, arguments.plugin) for path in arguments.scene]
+    shown = " ".join(str(path) for path in arguments.scene)
+    command = f"mi-radiosity gallery {shown} -o {arguments.output} --seconds {arguments.seconds:g}"
+    with progress_bars() as report:
+        page = write_gallery(
+            files,
+            arguments.output,
+            arguments.work,
+            seconds=arguments.seconds,
+            reference_spp=arguments.reference_spp,
+            denoise=arguments.denoise,
+            command=command + " --denoise" * arguments.denoise,
+            progress=report,
+        )
+    print(page)
 
 
 def _compare(arguments: argparse.Namespace) -> None:

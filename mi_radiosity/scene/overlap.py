@@ -122,38 +122,75 @@ def coplanar_pairs(
 ) -> np.ndarray:
     """Ordered pairs (f, g) of ``sound`` faces in one plane whose interiors meet (two int [pairs])."""
     low, high = corners.min(axis=1), corners.max(axis=1)
-    found = [np.zeros((0, 2), dtype=np.int64)]
-
-    def larger_first(f, g):
-        """The larger face knows its plane best."""
-        larger = area[f] >= area[g]
-        return np.where(larger, f, g), np.where(larger, g, f)
-
-    centre = (low.min(axis=0) + high.max(axis=0)) / 2
-    first, normals = owned_vectors(mi.Point3f, corners[:, 0] - centre), owned_vectors(mi.Vector3f, normal)
-    areas = owned(mi.Float, area)
-
-    def near_plane(f, g):
-        """Is a corner of the smaller face near the plane of the larger one? Most pairs end here, so on the device."""
-        f, g = mi.UInt32(f.astype(np.uint32)), mi.UInt32(g.astype(np.uint32))
-        larger = dr.gather(mi.Float, areas, f) >= dr.gather(mi.Float, areas, g)
-        f, g = dr.select(larger, f, g), dr.select(larger, g, f)
-        d = dr.gather(mi.Point3f, first, g) - dr.gather(mi.Point3f, first, f)
-        near = dr.abs(dr.dot(d, dr.gather(mi.Vector3f, normals, f))) <= dr.opaque(mi.Float, 4 * tolerance)
-        return np.array(near).astype(bool)
-
-    for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, near_plane):
-        f, g = larger_first(f, g)
-        height = ((corners[g] - corners[f, :1]) * normal[f, None]).sum(axis=2)
-        near = np.abs(height).max(axis=1) <= tolerance
-        f, g = f[near], g[near]
-        axis = np.abs(normal[f]).argmax(axis=1)
-        kept = np.array([[1, 2], [2, 0], [0, 1]])[axis][:, None, :]
-        p, q = (np.take_along_axis(corners[k], np.broadcast_to(kept, (len(k), 3, 2)), axis=2) for k in (f, g))
-        meet = _triangles_meet(p, q, tolerance)
+    faces, found = _Triangles(corners, normal, area, tolerance), [np.zeros((0, 2), dtype=np.int64)]
+    for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, faces.near_plane):
+        meet = faces.meet(f, g)
         found.append(np.column_stack([f[meet], g[meet]]))
     pairs = np.concatenate(found)
     return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+
+
+class _Triangles:
+    """Faces on the device: many pairs are looked at, and few are left. The larger of two knows its plane best."""
+
+    def __init__(self, corners: np.ndarray, normal: np.ndarray, area: np.ndarray, tolerance: float) -> None:
+        corners = corners - (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
+        self._corners = [[owned(mi.Float64, corners[:, k, axis]) for axis in range(3)] for k in range(3)]
+        self._normal = [owned(mi.Float64, normal[:, axis]) for axis in range(3)]
+        self._area, self._tolerance = owned(mi.Float64, area), dr.opaque(mi.Float64, tolerance)
+
+    def near_plane(self, f: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """Is a corner of the smaller face near the plane of the larger one (bool [n])? Most pairs end here."""
+        f, g = self._larger_first(f, g)
+        return self._read(dr.abs(self._height(f, g, 0)) <= self._tolerance)
+
+    def meet(self, f: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """Do faces lie in one plane, and share more than the tolerance in it (bool [n])? By separating lines."""
+        if len(f) == 0:
+            return np.zeros(0, dtype=bool)
+        f, g = self._larger_first(f, g)
+        meet = mi.Bool(True)
+        for k in range(3):
+            meet &= dr.abs(self._height(f, g, k)) <= self._tolerance
+        # Seen along the axis that the plane faces most.
+        x, y, z = (dr.abs(dr.gather(mi.Float64, n, f)) for n in self._normal)
+        first, second = (x >= y) & (x >= z), y >= z
+
+        def flat(face):
+            """Two coordinates of the three corners."""
+            rows = ([dr.gather(mi.Float64, c, face) for c in corner] for corner in self._corners)
+            return [
+                (dr.select(first, b, dr.select(second, c, a)), dr.select(first, c, dr.select(second, a, b)))
+                for a, b, c in rows
+            ]
+
+        p, q = flat(f), flat(g)
+        for t in (p, q):
+            for k in range(3):
+                ex, ey = (t[(k + 1) % 3][axis] - t[k][axis] for axis in range(2))
+                margin = self._tolerance * dr.sqrt(ex * ex + ey * ey)
+                ends = []
+                for triangle in (p, q):
+                    a, b, c = (v * ex - u * ey for u, v in triangle)
+                    ends.append((dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))))
+                (low_p, high_p), (low_q, high_q) = ends
+                meet &= (low_p < high_q - margin) & (low_q < high_p - margin)
+        return self._read(meet)
+
+    def _larger_first(self, f, g):
+        f, g = mi.UInt32(f.astype(np.uint32)), mi.UInt32(g.astype(np.uint32))
+        larger = dr.gather(mi.Float64, self._area, f) >= dr.gather(mi.Float64, self._area, g)
+        return dr.select(larger, f, g), dr.select(larger, g, f)
+
+    def _height(self, f, g, k):
+        """How far corners k of faces g are above the planes of faces f, m (Float64 [n])."""
+        return sum(
+            (dr.gather(mi.Float64, x, g) - dr.gather(mi.Float64, x0, f)) * dr.gather(mi.Float64, n, f)
+            for x, x0, n in zip(self._corners[k], self._corners[0], self._normal)
+        )
+
+    def _read(self, which):
+        return np.array(which).astype(bool)
 
 
 def _covered(corners, under, over, shape):
@@ -226,19 +263,6 @@ def surfaces(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
     level = (normal[f] * normal[g]).sum(axis=1) > 1 - 1e-6
     f, g = f[level], g[level]
     return components(n, f, g)
-
-
-def _triangles_meet(p, q, tolerance):
-    """Do interiors of triangles p and q [n, 3, 2] share more than ``tolerance`` (bool [n])? By separating lines."""
-    meet = np.ones(len(p), dtype=bool)
-    for t in (p, q):
-        for k in range(3):
-            edge = t[:, (k + 1) % 3] - t[:, k]
-            length = np.maximum(np.hypot(*edge.T), np.finfo(float).tiny)
-            across = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
-            a, b = ((x * across[:, None]).sum(axis=2) for x in (p, q))
-            meet &= (a.min(axis=1) < b.max(axis=1) - tolerance) & (b.min(axis=1) < a.max(axis=1) - tolerance)
-    return meet
 
 
 def _inside(points, triangles):

@@ -7,7 +7,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import opaque_index
-from ..core.errors import RadiosityError
 from ..core.points import kronecker, triangle
 from ..scene import Model
 from ..transport.emit import AT_ONCE
@@ -17,6 +16,7 @@ RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEM
 SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
+SHARED = 3 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
 PROBES = 1 << 19  # rays that are timed
 # Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY = 110e6, 2.5e3, 4e3, 24
@@ -39,8 +39,9 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
 
     Time is a multiple of what some rays take that are traced here and now.
     """
-    count = wanted_elements(model, elements, None) or model.patches.count
-    rays = rays or default_rays(count)
+    leaves, shared = plan(model, elements, None)
+    count = leaves or model.patches.count
+    rays = rays or default_rays(shared or count)
     _trace(model)  # once before, as kernels are compiled
     start = time.perf_counter()
     _trace(model)
@@ -54,30 +55,32 @@ def default_rays(elements: int) -> int:
     return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
 
 
-def wanted_elements(model: Model, elements: int | None, epsilon: float | None) -> int | None:
-    """Leaves to refine to, or None where ε decides."""
+def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int | None, int | None]:
+    """Leaves to refine to, None where ε decides; and how many irradiances they may have, None if each has its own.
+
+    Faces that are smaller than the light needs share it: where fewer elements are asked for than there are faces, or
+    where there are very many by default. Then some go to faces that are larger than the light needs, too.
+    """
     count = model.patches.count
     if epsilon is not None:
-        return None
+        return None, None
     if elements is None:
-        return count + ELEMENTS
-    if elements < count:
-        raise RadiosityError(
-            f"the scene has {count} patches, so {elements} elements cannot be reached: "
-            f"ask for at least {count} elements"
-        )
-    return elements
+        return count + ELEMENTS, SHARED if count + ELEMENTS > SHARED else None
+    return (elements, None) if elements >= count else (count + elements // 4, elements)
 
 
-def afford(model: Model, seconds: float, elements: int | None = None, rays: int | None = None) -> tuple[int, int]:
-    """Elements and rays, where they are not given, that a solve of about so many seconds has.
+def afford(
+    model: Model, seconds: float, elements: int | None = None, rays: int | None = None
+) -> tuple[int | None, int]:
+    """Elements and rays, where they are not given, that a solve of about so many seconds has; None for the default.
 
     Both go with the time, up to the default elements and MOST times the default rays.
     """
     usual = estimate_cost(model, elements, rays)
     share = min(max(seconds / max(usual.seconds, 1e-9), FEWEST), MOST)
-    count = elements or model.patches.count + round(ELEMENTS * min(share, 1))
-    return count, rays or round(share * usual.rays)
+    if elements is None and share < 1:
+        elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
+    return elements, rays or round(share * usual.rays)
 
 
 def _trace(model):

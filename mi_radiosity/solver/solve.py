@@ -8,12 +8,12 @@ import mitsuba as mi
 
 from ..core.errors import RadiosityError, interruptible
 from ..core.points import Stream, stream_seed
-from ..mesh import Exposure, Pairs, Tree
+from ..mesh import Clusters, Exposure, Pairs, Tree
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Transport
-from .cost import afford, default_rays, wanted_elements
+from .cost import afford, default_rays, plan
 from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
@@ -40,11 +40,12 @@ def solve(
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
-    elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without
-    either, 19,000 more than the scene has patches, unless the oracle finds less
-    to refine. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
-    elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random
-    lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
+    elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without either, 19,000 more
+    than the scene has patches, unless the oracle finds less to refine. Where fewer elements are asked for than there
+    are patches, neighbours share one irradiance (`Clusters`), as they do by default beyond 57,000. rays: rays that
+    carry the power and gather it, used exactly; by default 300 for each of the first 19,000 elements, and 20 for each
+    of all: light, not tessellation, decides what is needed. lines: random lines S per pair for the oracle. seed: any
+    integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
     default, while `Shooting()` shoots it only. layers: keep the light of every lamp by itself, for `Solution.relight`;
     the rays are shared out by the lamps' power. seconds: choose elements and rays, where they are not given, so that it
@@ -64,7 +65,7 @@ def solve(
     given = elements is not None
     if seconds is not None:
         elements, rays = afford(model, seconds - clock.total(), elements if epsilon is None else None, rays)
-    wanted = wanted_elements(model, elements if epsilon is None else None, epsilon)
+    wanted, shared = plan(model, elements if epsilon is None else None, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
@@ -77,14 +78,17 @@ def solve(
         epsilon,
         seed,
         lambda done: report("refine", done, wanted),
-        given,
+        given and shared is None,
     )
     refinement.run()
     mesh = tree.freeze()
-    problem = Problem(model, mesh, pairs.freeze(mesh), Exposure.of(mesh, model.rays, seed))
+    exposure = Exposure.of(mesh, model.rays, seed)
+    clusters = _clusters(model, mesh, exposure, shared, given)
+    problem = Problem(model, mesh, pairs.freeze(mesh), exposure, clusters=clusters)
+    count = clusters.count if clusters else tree.leaf_count
     clock.lap("refine")
 
-    rays = int(rays or default_rays(tree.leaf_count))
+    rays = int(rays or default_rays(count))
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays: a Flow."""
@@ -105,7 +109,8 @@ def solve(
     clock.lap("distribute")
 
     stats = {
-        "elements": tree.leaf_count,
+        "elements": count,
+        "leaves": tree.leaf_count,
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
         "rays": sum(flow.rays for flow in flows),
@@ -121,9 +126,22 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
-        "warnings": _warnings(tree.leaf_count, rays, light["caustic"]),
+        "warnings": _warnings(count, rays, light["caustic"]),
     } | ({"lamps": list(kept.names)} if layers else {})
     return Solution(exposure=problem.exposure, stats=stats, **light)
+
+
+def _clusters(model, mesh, exposure, shared, given):
+    """Clusters of the leaves if they are to have no more than ``shared`` irradiances, which must do if it was given."""
+    if shared is None or dr.width(mesh.leaves) <= shared:
+        return None
+    clusters = Clusters.make(model.faces, mesh, exposure, shared)
+    if given and clusters.count > shared:
+        raise RadiosityError(
+            f"{shared} elements cannot be reached: of {model.patches.count} patches only neighbours of one shape and "
+            f"of like normals share their light, so ask for at least {clusters.count}"
+        )
+    return clusters
 
 
 def _check(oracle, elements, epsilon, rays, lines, seconds):

@@ -64,7 +64,17 @@ class _Pass:
         self._problem, self._seed, self._progress = problem, seed, progress
         self.done = self._before = 0
         lights, leaves = problem.model.lights, problem.elements.leaves
-        area = np.array(dr.gather(mi.Float, problem.exposure.open_area, leaves), dtype=np.float64)
+        area = mi.Float64(dr.gather(mi.Float, problem.exposure.open_area, leaves))
+        whole, first = mi.Float64(dr.gather(mi.Float, problem.elements.area, leaves)), leaves
+        if clusters := problem.clusters:
+            area, whole = clusters.sums([area, area, area])[0], clusters.sums([whole, whole, whole])[0]
+            first = dr.gather(
+                mi.UInt32, clusters.member, dr.gather(mi.UInt32, clusters.start, dr.arange(mi.UInt32, clusters.count))
+            )
+            first = dr.gather(mi.UInt32, leaves, first)
+        self._open, self._keys = area / whole, problem.elements.key(first)
+        dr.eval(self._open, self._keys)
+        area = np.array(area)
         # A line looks at one of the lamps that are surfaces, and at each of the others.
         cost = RAYS_PER_LINE + len(lights.free) + bool(lights.exitance.any())
         self._lines = _share_out(area**0.25, budget // cost)
@@ -75,7 +85,7 @@ class _Pass:
         """Irradiance straight from the lamps, by lines to them."""
         e, exposure, model = self._problem.elements, self._problem.exposure, self._problem.model
         bound = [1e5 * self._most_from_lamps() * int(self._lines.max())] * 3
-        self._direct, self._alone = (ColorSums(dr.width(e.leaves), bound) for _ in range(2))
+        self._direct, self._alone = (ColorSums(len(self._lines), bound) for _ in range(2))
         self._landings = Landings(exposure.slots)
         self._gatherer = Gatherer(model, e, exposure, Landings(0), dr.zeros(mi.Color3f, len(e)))
         self._sample_all(1, self._alone)
@@ -87,7 +97,7 @@ class _Pass:
         reflected = e.reflectance * (pull(e, known.direct, exposure.open_area) + flow.indirect)
         self._gatherer = self._gatherer.seeing(reflected, known.landings.filled_by(flow.landings))
         most = self._most_from_lamps() + dr.max(flow.direct + flow.indirect, axis=None)[0]
-        indirect = ColorSums(dr.width(e.leaves), [1e5 * most * int(self._lines.max())] * 3)
+        indirect = ColorSums(len(self._lines), [1e5 * most * int(self._lines.max())] * 3)
         self._before = flow.rays
         self._sample_all(RAYS_PER_LINE, indirect)
         light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(self._direct), self._means(indirect))))
@@ -105,10 +115,10 @@ class _Pass:
             self._progress(self._before + self.done)
 
     def _means(self, sums):
-        """Irradiance of the open part of the leaves from sums of their samples (3 Float64 [leaves])."""
-        e, lines = self._problem.elements, mi.Float64(owned(mi.Float, self._lines))
-        whole = mi.Float64(1 / self._problem.exposure.open_share(e, e.leaves))
-        return [c / lines * whole for c in sums.gather(dr.arange(mi.UInt32, dr.width(e.leaves)))]
+        """Irradiance of the open part of the leaves from sums of samples (3 Float64 [leaves])."""
+        lines, rows = mi.Float64(owned(mi.Float, self._lines)), dr.arange(mi.UInt32, len(self._lines))
+        means = [c / lines / self._open for c in sums.gather(rows)]
+        return self._problem.clusters.spread(means) if self._problem.clusters else means
 
     def _seen(self):
         """Light of the lamps as lines have found it. Next to a lamp a line may find any multiple of what there is; as
@@ -158,10 +168,12 @@ class _Pass:
         e, rays, patches = problem.elements, problem.model.rays, problem.model.patches
         row = lower_bound(start, sample + 1) - 1
         number = sample - dr.gather(mi.UInt32, start, row)
-        leaf = dr.gather(mi.UInt32, e.leaves, row)
-        seed = opaque_index(self._seed + (not line))
-        keys = e.key(e.leaves)
+        seed, keys = opaque_index(self._seed + (not line)), self._keys
         x0, x1, s, t = kronecker(number, keys, seed, row)
+        of = row
+        if problem.clusters:
+            of, x0 = problem.clusters.pick(row, x0)
+        leaf = dr.gather(mi.UInt32, e.leaves, of)
         patch = dr.gather(mi.UInt32, e.patch, leaf)
         u, v = e.patch_point(leaf, *triangle(x0, x1))
         on_top = rays.on_top(patch, u, v)

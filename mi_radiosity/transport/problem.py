@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
-from ..mesh import Elements, Exposure, Pairs
+from ..mesh import Clusters, Elements, Exposure, Pairs
 from ..scene import Model
 from .landings import Landings
 
@@ -18,6 +18,7 @@ class Problem:
     pairs: Pairs
     exposure: Exposure
     known: "Known | None" = None
+    clusters: Clusters | None = None  # leaves that share one irradiance, if any do
 
 
 @dataclass(frozen=True)

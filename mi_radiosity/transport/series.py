@@ -152,6 +152,8 @@ class _Series:
         """Irradiance of the leaves from a Tally (3 Float64 [leaves])."""
         received = push(self.problem.elements, tally, self.problem.elements.leaves, self.problem.exposure.open_area)
         received = [h * dr.opaque(mi.Float64, s) for h, s in zip(received, scale)]
+        if self.problem.clusters:
+            received = self.problem.clusters.means(received, self.area)
         dr.eval(received)
         return received
 

@@ -1,0 +1,118 @@
+"""Clusters of faces: where faces are smaller than what the light needs, neighbours share one irradiance."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import NONE, ColorSums, components, lower_bound_within, owned, totals
+from ..scene.faces import Faces
+from .elements import Elements
+from .exposure import Exposure
+
+BINS = 2.0  # per unit of a normal's coordinates: normals of a cluster are within some 25° of each other
+ROUNDS = 12  # of the search for a size
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """Leaves that share one irradiance, in the order of ``elements.leaves``. Immutable.
+
+    A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube; leaves of divided
+    patches, lamps, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each leaf; there
+    are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster after cluster, beginning at ``start``
+    (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with each, from the first of all on, m².
+    Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
+    """
+
+    count: int
+    of: "mi.UInt32"
+    member: "mi.UInt32"
+    start: "mi.UInt32"
+    until: "mi.Float64"
+
+    @staticmethod
+    def make(faces: Faces, elements: Elements, exposure: Exposure, wanted: int) -> "Clusters":
+        """Clusters so large that there are no more than ``wanted``, or as few as there can be."""
+        leaves = elements.leaves
+        patch = np.array(dr.gather(mi.UInt32, elements.patch, leaves))
+        lone = np.array(elements.level(leaves)) > 0
+        lone |= np.array(dr.gather(mi.UInt32, exposure.slot, leaves)) != NONE
+        lone |= np.array(dr.max(elements.emission(leaves)) > 0).astype(bool)
+        p = elements.patches
+        face, back = np.array(p.face)[patch], np.array(p.back).astype(np.int64)[patch]
+        a, b = _neighbours(faces, face, back, ~lone)
+        centre = faces.corners[face].mean(axis=1) - faces.corners.min(axis=(0, 1))
+        bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS)
+        alike = (faces.shape[face][a] == faces.shape[face][b]) & (bins[a] == bins[b]).all(axis=1)
+        a, b, n = a[alike], b[alike], len(face)
+        low, high = 0.0, None
+        size = np.sqrt(faces.area[face[~lone]].sum() / max(wanted - lone.sum(), 1)) if (~lone).any() else 1.0
+        label, best = np.arange(n), n
+        for _ in range(ROUNDS):
+            cell = np.floor(centre / size)
+            joined = (cell[a] == cell[b]).all(axis=1)
+            found = components(n, a[joined], b[joined])
+            count = len(np.unique(found))
+            if count <= wanted or (high is None and count < best):
+                label, best = found, count
+            if count <= wanted:
+                high = size
+                if count > 0.97 * wanted:
+                    break
+            else:
+                low = size
+            size = (low + high) / 2 if high is not None else 1.5 * size
+        return Clusters._from_labels(label, np.array(dr.gather(mi.Float, elements.area, leaves), dtype=np.float64))
+
+    @staticmethod
+    def _from_labels(label: np.ndarray, area: np.ndarray) -> "Clusters":
+        _, of = np.unique(label, return_inverse=True)
+        member = np.argsort(of, kind="stable")
+        start = np.searchsorted(of[member], np.arange(of.max() + 2))
+        until = owned(mi.Float64, np.cumsum(area[member]))
+        of, member, start = (owned(mi.UInt32, x) for x in (of, member, start))
+        return Clusters(dr.width(start) - 1, of, member, start, until)
+
+    def pick(self, cluster: "mi.UInt32", lot: "mi.Float") -> "tuple[mi.UInt32, mi.Float]":
+        """A leaf of clusters, drawn by area with ``lot`` in [0, 1): its row, and what is left of the lot, as uniform
+        (UInt32, Float [n])."""
+        first, end = (dr.gather(mi.UInt32, self.start, cluster + k) for k in (0, 1))
+        low = dr.select(first > 0, dr.gather(mi.Float64, self.until, dr.maximum(first, 1) - 1), 0)
+        high = dr.gather(mi.Float64, self.until, end - 1)
+        place = low + mi.Float64(lot) * (high - low)
+        at = lower_bound_within(self.until, place, first, end - 1)
+        below = dr.select(at > 0, dr.gather(mi.Float64, self.until, dr.maximum(at, 1) - 1), 0)
+        width = dr.gather(mi.Float64, self.until, at) - below
+        rest = dr.clip(mi.Float((place - below) / dr.maximum(width, 1e-300)), 0, 1 - 2.0**-24)
+        return dr.gather(mi.UInt32, self.member, at), rest
+
+    def sums(self, values: "list[mi.Float64]") -> "list[mi.Float64]":
+        """Sums over clusters of values ≥ 0 of the leaves (3 Float64 [leaves] ─► [count])."""
+        sums = ColorSums(self.count, [2 * t for t in totals(values)])
+        sums.add(values, self.of)
+        return sums.gather(dr.arange(mi.UInt32, self.count))
+
+    def spread(self, values: "list[mi.Float64]") -> "list[mi.Float64]":
+        """Values of clusters, for each of their leaves (3 Float64 [count] ─► [leaves])."""
+        return [dr.gather(mi.Float64, v, self.of) for v in values]
+
+    def means(self, values: "list[mi.Float64]", area: "mi.Float64") -> "list[mi.Float64]":
+        """Values of the leaves averaged over clusters by ``area``, for each of their leaves (3 Float64 [leaves])."""
+        whole = self.sums([area, area, area])[0]
+        return self.spread([s / whole for s in self.sums([v * area for v in values])])
+
+
+def _neighbours(faces, face, back, chosen):
+    """Pairs of ``chosen`` rows whose faces, on one side, share an edge (two int [links])."""
+    rows = np.flatnonzero(chosen)
+    corners = np.round((faces.corners[face[rows]] - faces.centre).reshape(-1, 3), 9) + 0.0
+    _, vertex = np.unique(corners, axis=0, return_inverse=True)
+    vertex = vertex.reshape(len(rows), 3).astype(np.int64)
+    ends = np.stack([vertex, np.roll(vertex, -1, axis=1)]).reshape(2, -1)
+    key = (ends.min(axis=0) << 32 | ends.max(axis=0)) * 2 + np.repeat(back[rows], 3)
+    owner = np.repeat(rows, 3)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    return owner[order[:-1][same]], owner[order[1:][same]]

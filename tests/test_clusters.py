@@ -1,0 +1,119 @@
+"""Clusters of faces: what they are, that they keep all light, and that they look like the faces themselves."""
+
+import mi_radiosity as mr
+from mi_radiosity.core.points import kronecker
+from mi_radiosity.evaluation import ladder
+from mi_radiosity.mesh import Clusters, Exposure, Tree
+from mi_radiosity.scene import Model
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import balance, lamp
+from scipy import stats
+
+T = mi.ScalarTransform4f
+
+
+@pytest.fixture(scope="module")
+def room():
+    return ladder.room(12_000)
+
+
+@pytest.fixture(scope="module")
+def model(room):
+    return Model(room)
+
+
+@pytest.fixture(scope="module")
+def clusters(model):
+    """With their mesh."""
+    mesh = Tree(model.patches, model.materials, model.lights).freeze()
+    exposure = Exposure.of(mesh, model.rays, 0)
+    return Clusters.make(model.faces, mesh, exposure, 4_000), mesh
+
+
+def test_clusters_are_parts_of_one_side_of_one_shape(model, clusters):
+    """Of like normals, too; every leaf is in one of them."""
+    found, mesh = clusters
+    of, member, start = (np.array(x) for x in (found.of, found.member, found.start))
+    assert found.count <= 4_000 < len(of) == model.patches.count
+    assert sorted(member) == list(range(len(of))) and (np.diff(start) > 0).all() and start[-1] == len(of)
+    assert (of[member] == np.repeat(np.arange(found.count), np.diff(start))).all()
+    face = np.array(mesh.patches.face)[np.array(mesh.leaves)]
+    back = np.array(mesh.patches.back)[np.array(mesh.leaves)]
+    normal = model.faces.normal[face] * np.where(back, -1, 1)[:, None]
+    for rows in np.split(member, start[1:-1]):
+        assert len(set(model.faces.shape[face[rows]])) == len(set(back[rows])) == 1
+        assert (normal[rows] @ normal[rows[0]] > 0.6).all()
+
+
+def test_leaves_are_picked_by_area(clusters):
+    """χ² over the leaves of the largest cluster; and what is left of the lot is uniform."""
+    found, mesh = clusters
+    start, member = np.array(found.start), np.array(found.member)
+    largest = int(np.diff(start).argmax())
+    n = 100_000
+    lot = kronecker(dr.arange(mi.UInt32, n), mi.UInt32(1), mi.UInt32(2))[0]
+    row, rest = found.pick(dr.full(mi.UInt32, largest, n), lot)
+    rows = member[start[largest] : start[largest + 1]]
+    area = np.array(dr.gather(mi.Float, mesh.area, mesh.leaves), dtype=np.float64)[rows]
+    counts = np.bincount(np.array(row), minlength=len(member))[rows]
+    assert counts.sum() == n and len(rows) > 2
+    assert stats.chisquare(counts, n * area / area.sum()).pvalue > 1e-3
+    assert stats.kstest(np.array(rest), "uniform").pvalue > 1e-3
+
+
+def test_means_keep_the_sum(clusters):
+    found, mesh = clusters
+    area = mi.Float64(dr.gather(mi.Float, mesh.area, mesh.leaves))
+    values = [mi.Float64(np.random.default_rng(k).random(dr.width(area))) for k in range(3)]
+    for before, after in zip(values, found.means(values, area)):
+        assert dr.sum(after * area)[0] == pytest.approx(dr.sum(before * area)[0], rel=1e-9)
+        assert len(np.unique(np.round(np.array(after), 9))) <= found.count
+
+
+def test_fewer_elements_than_faces(room, model):
+    """Asked for, and there: the power is kept, the picture's means those of `path`."""
+    film = {"type": "hdrfilm", "width": 48, "height": 48, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    look = T().look_at([0.5, 0.5, 1.8], [5, 4, 0.8], [0, 0, 1])
+    camera = mi.load_dict({"type": "perspective", "fov": 70, "to_world": look, "film": film})
+    solution = mr.solve(model, elements=4_000, rays=400_000)
+    found = solution.stats
+    assert found["elements"] <= 4_000 < model.patches.count <= found["leaves"]
+    assert balance(solution) == pytest.approx(1, abs=1e-3)
+    assert found["power"]["shown"] == pytest.approx(found["power"]["absorbed"], rel=1e-3)
+    path = mi.load_dict({"type": "path", "max_depth": -1})
+    true = np.mean([mi.render(room, integrator=path, sensor=camera, spp=128, seed=k) for k in range(4)])
+    for shading, bias in (("gather", 0.01), ("gouraud", 0.02)):
+        assert np.mean(solution.render(camera, spp=64, shading=shading)) == pytest.approx(true, rel=bias)
+
+
+def test_clusters_in_a_furnace():
+    """Nothing but noise is wrong where all is alike: B = E / (1 − ρ)."""
+    vertices, faces = ladder._box(8)
+    shape = ladder._mesh([(vertices, faces[:, ::-1])], 0.5, lamp())
+    solution = mr.solve(mi.load_dict({"type": "scene", "box": shape}), mr.Uniform(), elements=768, rays=200_000)
+    leaves = solution.leaves()
+    assert np.average(leaves.radiosity[:, 0], weights=leaves.area) == pytest.approx(2, rel=1e-3)
+
+
+def test_too_few_elements_are_refused_with_the_fewest(model):
+    with pytest.raises(mr.RadiosityError, match="cannot be reached: of .* ask for at least [0-9]+"):
+        mr.solve(model, elements=3, rays=10_000)
+
+
+def test_the_same_seed_gives_the_same_clusters(model):
+    one, two = (mr.solve(model, elements=4_000, rays=50_000) for _ in range(2))
+    np.testing.assert_array_equal(np.array(one.irradiance()), np.array(two.irradiance()))
+
+
+def test_the_ladder(capsys):
+    """A row per size, the sizes being about those that were asked for."""
+    ladder.main(["1000", "4000", "--rays", "100000"])
+    head, *rows = capsys.readouterr().out.splitlines()
+    faces = [int(row.split()[0].replace(",", "")) for row in rows]
+    assert "faces" in head and len(rows) == 2
+    assert faces[0] < 4_000 and faces[1] == pytest.approx(4_000, rel=0.5)
+    assert all(float(row.split()[-2]) > 0 for row in rows)

@@ -1,0 +1,245 @@
+"""Pictures that grow: within a time, denoised, of rough metal; and a gallery of them."""
+
+import re
+
+import mi_radiosity as mr
+from mi_radiosity.cli import main
+from mi_radiosity.display import denoise, pixels
+from mi_radiosity.scene import Model
+from mi_radiosity.solver import cost
+from mi_radiosity.transport import Gatherer
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from conftest import diffuse, lamp, rectangle, scene
+
+BOX = "scenes_xml/cornell_box.xml"
+T = mi.ScalarTransform4f
+PATH = {"type": "path", "max_depth": -1}
+
+
+@pytest.fixture(scope="module")
+def box():
+    parts = mi.cornell_box()
+    parts["sensor"]["film"] |= {"width": 48, "height": 48}
+    return mi.load_dict(parts)
+
+
+@pytest.fixture(scope="module")
+def solution(box):
+    return mr.solve(box, elements=1500, rays=200_000)
+
+
+# ---- Within a time ---------------------------------------------------------------------------------
+
+
+class Clock:
+    """Time that passes only when samples are taken, a second each."""
+
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+class Counted:
+    """A picture that counts."""
+
+    def __init__(self, clock, each=1.0):
+        self.clock, self.each, self.passes, self.seeds = clock, each, [], []
+
+    def add(self, spp, seed):
+        self.clock.now += self.each * spp
+        self.passes.append(spp)
+        self.seeds.append(seed)
+
+    def image(self):
+        return sum(self.passes)
+
+
+@pytest.mark.parametrize("seconds", [0.5, 3, 10, 1000])
+def test_passes_double_and_fill_the_time(seconds, monkeypatch):
+    clock, told = Clock(), []
+    monkeypatch.setattr(pixels, "time", clock)
+    picture = Counted(clock)
+    done = pixels.grow(picture, 0, seconds, lambda image, samples: told.append((image(), samples)))
+    assert done == sum(picture.passes) == told[-1][1] and all(image == samples for image, samples in told)
+    assert len(set(picture.seeds)) == len(picture.seeds)
+    assert done == 1 if seconds < 1 else 0.85 * seconds - 1 <= done <= seconds
+    assert len(picture.passes) < 20
+
+
+def test_a_picture_within_a_time_is_as_right_as_others(box, solution):
+    """Its passes are independent and add up: the mean agrees with path to 1 %, and there is one after every pass."""
+    seen = []
+    image = solution.render(shading="gather", seconds=1.5, show=lambda image, samples: seen.append(samples))
+    true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(4)])
+    assert np.mean(image) == pytest.approx(true, rel=0.01) and seen == sorted(set(seen)) and seen[0] == 1
+    clean = solution.render(shading="gather", seconds=0.5, denoise=True)
+    assert np.mean(clean) == pytest.approx(true, rel=0.03)  # the denoiser takes fireflies away
+
+
+def test_solves_get_what_the_time_allows(box, monkeypatch):
+    """Elements and rays go with the time, up to a mesh and rays that add no more; what is given stays."""
+    model = Model(box)
+    usual = cost.estimate_cost(model)
+    monkeypatch.setattr(cost, "estimate_cost", lambda *_: usual)
+    budgets = [cost.afford(model, usual.seconds * share) for share in (0, 0.1, 0.5, 1, 3, 1000)]
+    elements, rays = zip(*budgets)
+    assert list(elements[:3]) == sorted(elements[:3]) and list(rays) == sorted(rays)
+    assert budgets[3] == (None, usual.rays) and elements[4:] == (None, None)  # as by default
+    assert rays[-1] == cost.MOST * usual.rays and model.patches.count < elements[0] < usual.elements
+    monkeypatch.undo()
+    solution = mr.solve(box, seconds=0.05, rays=10_000)
+    assert solution.stats["rays"] == 10_000 and solution.stats["elements"] < usual.elements
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf")])
+def test_impossible_times_are_refused(box, solution, seconds):
+    for ask in (lambda: mr.solve(box, seconds=seconds), lambda: solution.render(seconds=seconds)):
+        with pytest.raises(mr.RadiosityError, match="seconds must be a number greater than 0"):
+            ask()
+
+
+def test_seconds_on_the_command_line(tmp_path, capsys):
+    out = tmp_path / "box.exr"
+    assert main(["render", BOX, "-o", str(out), "--seconds", "0.5"]) == 0 and out.is_file()
+    assert main(["render", BOX, "-o", str(out), "--seconds", "1", "--spp", "4"]) == 2
+    assert "either --spp or --seconds" in capsys.readouterr().err
+    assert main(["render", BOX, "-o", str(out), "--seconds", "-1"]) == 2
+    assert "not a number greater than 0" in capsys.readouterr().err
+
+
+def test_an_interrupt_keeps_the_best_so_far(tmp_path, capsys, monkeypatch):
+    out, add = tmp_path / "box.exr", pixels.FilmPicture.add
+
+    def interrupted(self, spp, seed):
+        if spp > 2:
+            raise KeyboardInterrupt
+        add(self, spp, seed)
+
+    monkeypatch.setattr(pixels.FilmPicture, "add", interrupted)
+    assert main(["render", BOX, "-o", str(out), "--seconds", "60", "--elements", "200", "--rays", "9000"]) == 130
+    found = re.search(r"interrupted: .*box.exr has (\d) samples per pixel", capsys.readouterr().err)
+    assert found and int(found[1]) >= 1 and np.isfinite(np.array(mi.Bitmap(str(out)))).all()
+
+
+# ---- Denoised --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gaussian", "tent", "mitchell", "box"])
+def test_a_filter_over_pixels_is_as_wide_as_the_film_s(name):
+    """Variances add up: that of the weights and of the pixel itself is that of the filter."""
+    rfilter = mi.load_dict({"type": name})
+    reach = int(np.ceil(rfilter.radius() - 0.5))
+    if reach < 1:
+        pytest.skip("one pixel is all there is")
+    weight = denoise._over_pixels(rfilter, reach)
+    x = np.linspace(-reach - 0.5, reach + 0.5, 2001)
+    curve = np.array([float(rfilter.eval(float(y))[0]) for y in x])
+    wide = (curve @ x**2) / curve.sum()
+    assert weight.sum() == pytest.approx(1)
+    assert weight @ np.arange(-reach, reach + 1) ** 2 + 1 / 12 == pytest.approx(max(wide, 1 / 12), rel=0.03, abs=1e-3)
+
+
+# ---- Rough metal -----------------------------------------------------------------------------------
+
+
+def plate(lamp):
+    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
+    look = T().look_at([-1.5, 0, 1.0], [0, 0, 0], [0, 0, 1])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {"type": "perspective", "fov": 60, "to_world": look, "film": film},
+            "plate": rectangle(bsdf={"type": "roughconductor", "alpha": 0.2}),
+            "wall": rectangle(T().translate([1, 0, 1]).rotate([0, 1, 0], -90), bsdf=diffuse(0.5)),
+            "lamp": lamp,
+        }
+    )
+
+
+LAMPS = {
+    "area": rectangle(
+        T().translate([0.4, 0, 1.2]).rotate([1, 0, 0], 180).scale(0.1), bsdf=diffuse(0), emitter=lamp(300)
+    ),
+    "point": {"type": "point", "position": [0.4, 0, 1.2], "intensity": 3.0},
+    "sky": {"type": "constant", "radiance": 0.5},
+}
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_rough_metal_mirrors_lamps_as_path_sees_them(name):
+    truth = plate(LAMPS[name])
+    solution = mr.solve(truth, rays=200_000)
+    ours, theirs = (
+        np.array([np.array(image)[..., :3] for image in images])
+        for images in (
+            [solution.render(spp=64, shading="gather", seed=seed) for seed in range(6)],
+            [mi.render(truth, integrator=mi.load_dict(PATH), spp=256, seed=seed) for seed in range(6)],
+        )
+    )
+    (a, e), (b, f) = ((x.mean(), x.mean(axis=(1, 2, 3)).std(ddof=1) / 6**0.5) for x in (ours, theirs))
+    assert abs(a - b) < 4 * np.hypot(e, f) + 0.01 * b
+
+
+def test_lines_from_rough_metal_take_its_noise_away():
+    """A third of the noise that the lobe's own rays have, at as many samples."""
+    solution = mr.solve(plate(LAMPS["area"]), mr.Uniform(), elements=500, rays=100_000)
+    noise = []
+    for highlights in (solution.gatherer.highlights, None):
+        solution.gatherer.highlights = highlights
+        noise.append(np.std([solution.render(spp=16, shading="gather", seed=seed) for seed in range(6)], axis=0).mean())
+    assert noise[0] < noise[1] / 3
+
+
+# ---- Leaves that walls cross -----------------------------------------------------------------------
+
+
+def test_looking_up_light_beside_walls_loses_none():
+    """Over crossed leaves, what rays would find adds up to ρ H A: all of it is where the light came down."""
+    wall = rectangle(
+        T().translate([0.13, 0, 0]).rotate([0, 1, 0], 90).scale([1, 0.9, 1]), bsdf=diffuse(0.5, two_sided=True)
+    )
+    panel = rectangle(T().translate([0.5, 0, 0.9]).rotate([1, 0, 0], 180).scale(0.3), bsdf=diffuse(0), emitter=lamp())
+    room = scene(room={"type": "cube", "flip_normals": True, "bsdf": diffuse(0.5)}, wall=wall, panel=panel)
+    solution = mr.solve(room, mr.Uniform(), elements=300, rays=300_000)
+    e, exposure, gatherer = solution.elements, solution.exposure, solution.gatherer
+    crossed = dr.gather(mi.UInt32, e.leaves, dr.compress(dr.gather(mi.UInt32, exposure.slot, e.leaves) != 0xFFFFFFFF))
+    n, m = dr.width(crossed), 4096
+    assert n > 10 and isinstance(gatherer, Gatherer)
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, n * m))
+    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
+    leaf = dr.gather(mi.UInt32, crossed, dr.arange(mi.UInt32, n * m) // m)
+    patch = dr.gather(mi.UInt32, e.patch, leaf)
+    u, v = e.patch_point(leaf, mi.Float(a.astype(np.float32)), mi.Float(b.astype(np.float32)))
+
+    class Hit:
+        pass
+
+    hit = Hit()
+    hit.patch, hit.u, hit.v = patch, u, v
+    found = np.array(gatherer._looked_up(hit, dr.full(mi.Bool, True, n * m)).x).reshape(n, m).mean(axis=1)
+    want = np.array(dr.gather(mi.Float, e.reflectance.x * solution.irradiance().x, crossed))
+    want = want * np.array(exposure.open_share(e, crossed))
+    area = np.array(dr.gather(mi.Float, e.area, crossed))
+    assert (found * area).sum() == pytest.approx((want * area).sum(), rel=0.03)
+
+
+# ---- Gallery ---------------------------------------------------------------------------------------
+
+
+def test_gallery(tmp_path, capsys):
+    """A page with a strip of three pictures and the figures of each scene; references are kept."""
+    pytest.importorskip("matplotlib")
+    arguments = ["gallery", BOX, "-o", str(tmp_path), "--work", str(tmp_path / "work")]
+    assert main([*arguments, "--seconds", "0.5", "--reference-spp", "16"]) == 0
+    page = (tmp_path / "gallery.md").read_text(encoding="utf-8")
+    assert "cornell_box.xml" in page and "RMSE_a" in page and page.strip() in capsys.readouterr().out
+    strip = np.array(mi.Bitmap(str(tmp_path / "gallery" / "cornell_box.jpg")))
+    assert strip.shape[1] == 3 * strip.shape[0] and list((tmp_path / "work" / "references").glob("*.exr"))
+    assert main(["gallery", "missing.xml", "-o", str(tmp_path)]) == 2
+    assert "missing.xml" in capsys.readouterr().err
