@@ -10,7 +10,7 @@ import pytest
 
 pytestmark = pytest.mark.fast
 
-PAGES = [Path("README.md"), *sorted(Path("docs").glob("*.md"))]
+PAGES = [Path("README.md"), *(page for page in sorted(Path("docs").glob("*.md")) if page.name != "gallery.md")]
 BUDGETS = {"elements": 1_500, "rays": 50_000, "spp": 2}  # at most
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 

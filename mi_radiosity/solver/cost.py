@@ -47,7 +47,7 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     _trace(model)
     ray, more = (time.perf_counter() - start) / PROBES, count - model.patches.count
     memory = PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE)
-    return Cost(count, rays, memory, ray * (WORK * rays + LINES * more))
+    return Cost(shared or count, rays, memory, ray * (WORK * rays + LINES * more))
 
 
 def default_rays(elements: int) -> int:
