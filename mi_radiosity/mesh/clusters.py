@@ -19,11 +19,11 @@ ROUNDS = 12  # of the search for a size
 class Clusters:
     """Leaves that share one irradiance, in the order of ``elements.leaves``. Immutable.
 
-    A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube; leaves of divided
-    patches, lamps, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each leaf; there
-    are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster after cluster, beginning at ``start``
-    (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with each, from the first of all on, m².
-    Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
+    A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube (see `make`); leaves of
+    divided patches, lamps, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each
+    leaf; there are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster after cluster, beginning at
+    ``start`` (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with each, from the first of all
+    on, m². Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
     """
 
     count: int
@@ -34,36 +34,35 @@ class Clusters:
 
     @staticmethod
     def make(faces: Faces, elements: Elements, exposure: Exposure, wanted: int) -> "Clusters":
-        """Clusters so large that there are no more than ``wanted``, or as few as there can be."""
-        leaves = elements.leaves
+        """Clusters so large that there are no more than ``wanted``, or as few as there can be.
+
+        Where parts that are connected do not get so few, parts of one cube need not be, nor keep clear of walls.
+        """
+        leaves, p = elements.leaves, elements.patches
         patch = np.array(dr.gather(mi.UInt32, elements.patch, leaves))
         lone = np.array(elements.level(leaves)) > 0
-        lone |= np.array(dr.gather(mi.UInt32, exposure.slot, leaves)) != NONE
         lone |= np.array(dr.max(elements.emission(leaves)) > 0).astype(bool)
-        p = elements.patches
+        crossed = np.array(dr.gather(mi.UInt32, exposure.slot, leaves)) != NONE
         face, back = np.array(p.face)[patch], np.array(p.back).astype(np.int64)[patch]
-        a, b = _neighbours(faces, face, back, ~lone)
         centre = faces.corners[face].mean(axis=1) - faces.corners.min(axis=(0, 1))
-        bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS)
-        alike = (faces.shape[face][a] == faces.shape[face][b]) & (bins[a] == bins[b]).all(axis=1)
-        a, b, n = a[alike], b[alike], len(face)
-        low, high = 0.0, None
-        size = np.sqrt(faces.area[face[~lone]].sum() / max(wanted - lone.sum(), 1)) if (~lone).any() else 1.0
-        label, best = np.arange(n), n
-        for _ in range(ROUNDS):
-            cell = np.floor(centre / size)
+        bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS).astype(np.int64)
+        kind = _mixed(np.column_stack([faces.shape[face], back, bins]))
+        kind = np.where(lone, -1 - np.arange(len(face)), kind)  # like no other
+        a, b = _neighbours(faces, face, back, ~(lone | crossed))
+        a, b = (ends[kind[a] == kind[b]] for ends in (a, b))
+        size = np.sqrt(faces.area[face].sum() / max(wanted - lone.sum(), 1))
+
+        def connected(cell):
             joined = (cell[a] == cell[b]).all(axis=1)
-            found = components(n, a[joined], b[joined])
-            count = len(np.unique(found))
-            if count <= wanted or (high is None and count < best):
-                label, best = found, count
+            return components(len(face), a[joined], b[joined])
+
+        def near(cell):
+            return _mixed(np.column_stack([kind, np.where(lone[:, None], 0, cell)]))
+
+        for label_of in (connected, near):
+            label, count = _search(lambda size, of=label_of: of(np.floor(centre / size).astype(np.int64)), size, wanted)
             if count <= wanted:
-                high = size
-                if count > 0.97 * wanted:
-                    break
-            else:
-                low = size
-            size = (low + high) / 2 if high is not None else 1.5 * size
+                break
         return Clusters._from_labels(label, np.array(dr.gather(mi.Float, elements.area, leaves), dtype=np.float64))
 
     @staticmethod
@@ -102,6 +101,30 @@ class Clusters:
         """Values of the leaves averaged over clusters by ``area``, for each of their leaves (3 Float64 [leaves])."""
         whole = self.sums([area, area, area])[0]
         return self.spread([s / whole for s in self.sums([v * area for v in values])])
+
+
+def _search(label_at, size, wanted):
+    """Labels at the size of cubes that has nearly ``wanted`` of them, or the fewest found; and how many."""
+    low, high, best = 0.0, None, (None, np.inf)
+    for _ in range(ROUNDS):
+        label = label_at(size)
+        count = len(np.unique(label))
+        if count <= wanted or (high is None and count < best[1]):
+            best = label, count
+        if 0.97 * wanted < count <= wanted:
+            break
+        low, high = (low, size) if count <= wanted else (size, high)
+        size = 2 * size if high is None else (low + high) / 2
+    return best
+
+
+def _mixed(columns):
+    """One integer for each row of integers [n, m], the same for rows that are the same (int64 [n])."""
+    mixed = np.zeros(len(columns), dtype=np.uint64)
+    for column in columns.T:
+        mixed = (mixed ^ column.astype(np.int64).astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return (mixed >> np.uint64(1)).astype(np.int64)
 
 
 def _neighbours(faces, face, back, chosen):
