@@ -20,7 +20,7 @@ class Clusters:
     """Leaves that share one irradiance, in the order of ``elements.leaves``. Immutable.
 
     A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube (see `make`); leaves of
-    divided patches, lamps, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each
+    divided patches, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each
     leaf; there are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster after cluster, beginning at
     ``start`` (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with each, from the first of all
     on, m². Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
@@ -41,7 +41,6 @@ class Clusters:
         leaves, p = elements.leaves, elements.patches
         patch = np.array(dr.gather(mi.UInt32, elements.patch, leaves))
         lone = np.array(elements.level(leaves)) > 0
-        lone |= np.array(dr.max(elements.emission(leaves)) > 0).astype(bool)
         crossed = np.array(dr.gather(mi.UInt32, exposure.slot, leaves)) != NONE
         face, back = np.array(p.face)[patch], np.array(p.back).astype(np.int64)[patch]
         centre = faces.corners[face].mean(axis=1) - faces.corners.min(axis=(0, 1))

@@ -271,8 +271,11 @@ def cylinder_mesh(cylinder: "mi.Shape", share: float) -> "mi.Mesh":
 
 @mesher("Sphere")
 def sphere_mesh(sphere: "mi.Shape", share: float) -> "mi.Mesh":
-    """Eight octants of equal triangles with exactly the area of ``sphere``, and its normals."""
-    n = segments(share) // 4
+    """Eight octants of equal triangles with exactly the area of ``sphere``, and its normals.
+
+    Twice as fine as other shapes: lamps that cameras see are spheres more often, and their outlines bright.
+    """
+    n = segments(share) // 2
     j, i = (x[np.tril_indices(n + 1)] for x in np.indices((n + 1, n + 1)))  # from the pole down, and around
     at = lambda j, i: j * (j + 1) // 2 + i
     rows, k = j[j < n], i[j < n]
