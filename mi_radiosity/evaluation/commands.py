@@ -124,6 +124,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
     files = [scene_file(path, arguments.mode, definitions, arguments.plugin) for path in arguments.scene]
     shown = " ".join(str(path) for path in arguments.scene)
     command = f"mi-radiosity gallery {shown} -o {arguments.output} --seconds {arguments.seconds:g}"
+    command += f" --reference-spp {arguments.reference_spp}"
     with progress_bars() as report:
         page = write_gallery(
             files,

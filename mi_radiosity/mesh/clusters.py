@@ -12,7 +12,8 @@ from .elements import Elements
 from .exposure import Exposure
 
 BINS = 2.0  # per unit of a normal's coordinates: normals of a cluster are within some 25° of each other
-ROUNDS = 12  # of the search for a size
+ROUNDS = 10  # of the search for a size
+NEARLY = 0.85  # of the clusters wanted are enough of them
 
 
 @dataclass(frozen=True)
@@ -104,14 +105,15 @@ class Clusters:
 
 def _search(label_at, size, wanted):
     """Labels at the size of cubes that has nearly ``wanted`` of them, or the fewest found; and how many."""
-    low, high, best = 0.0, None, (None, np.inf)
+    low, high, best, last = 0.0, None, (None, np.inf), np.inf
     for _ in range(ROUNDS):
         label = label_at(size)
         count = len(np.unique(label))
         if count <= wanted or (high is None and count < best[1]):
             best = label, count
-        if 0.97 * wanted < count <= wanted:
+        if NEARLY * wanted < count <= wanted or (high is None and wanted < 0.98 * last < count):
             break
+        last = count
         low, high = (low, size) if count <= wanted else (size, high)
         size = 2 * size if high is None else (low + high) / 2
     return best
