@@ -174,19 +174,22 @@ def _grow(arguments: argparse.Namespace, solution: "Solution", view: int, path: 
     """Write ever better pictures of a view; the last one stays, whenever it ends."""
     from .display import write_image
 
-    start, shown, least = time.perf_counter(), 0, 0.0
+    start, shown, taken, least = time.perf_counter(), 0, 0, 0.0
 
     def show(image: "Callable[[], mi.TensorXf]", samples: int) -> None:
-        nonlocal shown, least
-        now = time.perf_counter() - start
+        nonlocal shown, least, taken
+        now, taken = time.perf_counter() - start, samples
         if now >= least:
             before = time.perf_counter()
             write_image(path, image(), solution.stats | {"spp": samples})
             shown, least = samples, now + 20 * (time.perf_counter() - before)
 
     try:
-        image = solution.render(view, shading=arguments.shading, denoise=arguments.denoise, seconds=seconds, show=show)
-        write_image(path, image, solution.stats)
+        with interruptible():
+            image = solution.render(
+                view, shading=arguments.shading, denoise=arguments.denoise, seconds=seconds, show=show
+            )
+        write_image(path, image, solution.stats | {"spp": taken})
     except KeyboardInterrupt:
         if shown:
             warn([f"interrupted: {path} has {shown} samples per pixel"])

@@ -100,7 +100,7 @@ def test_clusters_in_a_furnace():
 
 
 def test_too_few_elements_are_refused_with_the_fewest(model):
-    with pytest.raises(mr.RadiosityError, match="cannot be reached: of .* ask for at least [0-9]+"):
+    with pytest.raises(mr.RadiosityError, match="cannot be reached: of .* ask for [0-9]+ or more"):
         mr.solve(model, elements=3, rays=10_000)
 
 

@@ -125,11 +125,13 @@ def _integrator_class():
                 emission *= hit.share
             look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
             radiance = dr.select(lit, self._shader.radiance(look), 0)
-            if model.lights.sky_light and not self.hide_emitters:
+            if model.lights.sky_light and (rays.lobes is not None or not self.hide_emitters):
                 direction = ray.d if rays.lobes is None else hit.direction
                 seen = 1 if rays.lobes is None else hit.share
+                if self.hide_emitters:  # only where it is seen directly
+                    seen = dr.select(hit.bounced, seen, 0)
                 radiance += model.lights.sky(direction, active & ~hit.valid) * seen * dr.inv_pi
-                valid |= active
+                valid |= active & (mi.Bool(not self.hide_emitters))
             if rays.lobes is not None:
                 radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
                 valid |= active & hit.bounced

@@ -25,7 +25,7 @@ HEAD = """# Gallery
 
 Left `path` at {spp:,} samples per pixel, then ours as `--seconds {seconds:g}` shows it{denoised}, and {times} times
 what lies between the two. RMSE_a is over 8-bit sRGB, the reference's noise removed; `path`'s is that of as many
-samples as it takes in our time. On two cores, kernels warm, reading and solving included. Made by
+samples as it takes in our time. Kernels warm, reading and solving included. Made by
 
     {command}
 

@@ -130,7 +130,8 @@ def main(argv: list[str] | None = None) -> None:
         command = [sys.executable, "-m", __spec__.name, "--one", str(triangles), "--rays", str(arguments.rays)]
         run = subprocess.run([*command, "--variant", arguments.variant], capture_output=True, text=True)
         if run.returncode:
-            raise RadiosityError(f"the room of {triangles} triangles failed: {run.stderr.strip().splitlines()[-1]}")
+            why = (run.stderr.strip() or f"status {run.returncode}").splitlines()[-1]
+            raise RadiosityError(f"the room of {triangles} triangles failed: {why}")
         row = json.loads(run.stdout.splitlines()[-1])
         print(
             f"{row['faces']:>10,} {row['patches']:>10,} {row['elements']:>10,} {row['rays']:>12,} "

@@ -24,7 +24,7 @@ class Trail:
     theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
     the end included (it is ``coated``), and of lamps that lines from rough lobes have found, times the weight there,
     W/m². ``share``: of the lamp that the end is on, or of the sky, what those lines leave to the ray. ``rough``: the
-    first surface with lobes is such a one.
+    first lobe on the way is such a one.
     """
 
     valid: "mi.Bool"
@@ -109,12 +109,12 @@ class Lobes:
         coated = hit.traced & drawn & on_patch & (dr.max(value) > 0)
         on = hit.traced & ~coated
         rough, share = dr.zeros(mi.Bool, dr.width(ray.d)), mi.Float(1)
+        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
         if rays.glossy:
             rough = on & is_glossy(bsdf)
         if rays.glossy and highlights is not None:
             share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
-            unlikely = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
-            pdf = dr.select(rough & ~unlikely, sample.pdf, 0)
+            pdf = dr.select(rough & ~smooth, sample.pdf, 0)
 
         shines = hit.traced & on_patch & (trail.bounced | camera)
         glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
@@ -142,7 +142,7 @@ class Lobes:
             taken=trail.taken + taken,
             glow=trail.glow + glow,
             share=dr.select(alive, share, trail.share),
-            rough=dr.select(trail.bounced, trail.rough, rough),
+            rough=dr.select(trail.bounced, trail.rough, rough & ~smooth),
         )
         ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
         return goes_on, ray, pdf, depth, random, trail

@@ -40,7 +40,8 @@ def solve(
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
-    elements: leaf elements wanted, reached to within 3; or epsilon: the ε of the oracle. Without either, 19,000 more
+    elements: leaf elements wanted, reached to within 3, or 15 % where leaves share; or epsilon: the ε of the oracle.
+    Without either, 19,000 more
     than the scene has patches, unless the oracle finds less to refine. Where fewer elements are asked for than there
     are patches, neighbours share one irradiance (`Clusters`), as they do by default beyond 57,000. rays: rays that
     carry the power and gather it, used exactly; by default 300 for each of the first 19,000 elements, and 20 for each
@@ -126,7 +127,7 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
-        "warnings": _warnings(count, rays, light["caustic"]),
+        "warnings": _warnings(count, rays, light["caustic"], flows if layers else []),
     } | ({"lamps": list(kept.names)} if layers else {})
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
@@ -139,7 +140,7 @@ def _clusters(model, mesh, exposure, shared, given):
     if given and clusters.count > shared:
         raise RadiosityError(
             f"{shared} elements cannot be reached: of {model.patches.count} patches only neighbours of one shape and "
-            f"of like normals share their light, so ask for at least {clusters.count}"
+            f"of like normals share their light, so ask for {3 * clusters.count // 2} or more"
         )
     return clusters
 
@@ -160,12 +161,16 @@ def _check(oracle, elements, epsilon, rays, lines, seconds):
             raise RadiosityError(f"{name} must be a number greater than 0, not {value}")
 
 
-def _warnings(elements, rays, caustic):
+def _warnings(elements, rays, caustic, flows):
     """What a user should know of the budget, and of light that is shown less well (list of str)."""
     enough, found = FEW_RAYS * elements, []
     if rays < enough:
         found.append(
             f"{rays:,} rays are few for {elements:,} elements, and noisy: give {enough:,} or more, or fewer elements"
+        )
+    elif few := sum(flow.rays < enough for flow in flows):
+        found.append(
+            f"{few} of {len(flows)} lamps are weak, have fewer than {enough:,} rays, and are noisy by themselves"
         )
     if caustic is not None and dr.any(caustic > 0, axis=None):
         found.append(

@@ -106,7 +106,7 @@ class LeafEmitter:
         share = self._exposure.open_share(self.elements, leaf)
         if self._landings is not None and self._landings.slots:
             slot = dr.gather(mi.UInt32, self._exposure.slot, leaf)
-            landed = slot != NONE
+            landed = self._landings.any_on(slot, slot != NONE)
             u, v = (dr.select(landed, a, b) for a, b in zip(self._landings.points(slot, ray, landed), (u, v)))
             share = dr.select(landed, 1, share)
         weight = mi.Float64(dr.gather(mi.UInt64, self._distribution.weight, at.row))

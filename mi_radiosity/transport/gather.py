@@ -153,7 +153,7 @@ class Gatherer:
         landed = self._landings.any_on(slot, crossed)
         x = e.patches.above(dr.select(met, hit.patch, 0), hit.u, hit.v)
         seen = self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed)
-        return H * dr.select(crossed, dr.select(seen, dr.gather(mi.Float, self._bright, slot, crossed), 0), 1)
+        return H * dr.select(landed, dr.select(seen, dr.gather(mi.Float, self._bright, slot, landed), 0), 1)
 
     def _share_of_rays(self, places, hit, met, rays_per_line):
         """The balance heuristic's weight of rays that meet lamps, c F / (p + c F) (Float [n])."""

@@ -15,7 +15,7 @@ from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
 from .problem import Flow, Known, Problem
-from .series import Shooting, Transport
+from .series import GLANCE, Shooting, Transport
 
 SHOOTING = Shooting()
 RAYS_PER_LINE = 2  # rays into the room per line to the lamps
@@ -101,7 +101,7 @@ class _Pass:
         self._before = flow.rays
         self._sample_all(RAYS_PER_LINE, indirect)
         light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(self._direct), self._means(indirect))))
-        landings = self._landings.settled()
+        landings = self._landings.settled().filled_by(flow.landings)
         return dataclasses.replace(flow, **light, landings=landings, rays=flow.rays + self.rays, shot=flow)
 
     def _sample_all(self, each, sums):
@@ -124,7 +124,7 @@ class _Pass:
         """Light of the lamps as lines have found it. Next to a lamp a line may find any multiple of what there is; as
         no place has more light from surfaces than the brightest of them sends out, more than twice that is noise."""
         means = self._means(self._alone)
-        if self._problem.model.lights.free:
+        if self._problem.model.lights.free or self._problem.model.lights.textured:
             return means
         most = dr.max(self._problem.model.patches.emission, axis=1)
         return [dr.minimum(h, mi.Float64(2 * c)) for h, c in zip(means, most)]
@@ -145,9 +145,10 @@ class _Pass:
         ]
         if self._problem.model.rays.lobes is not None:  # how much of the light goes straight is known to chance only
             have, want = (2 * [[a + b for a, b in zip(*both)]] for both in (have, want))
-        lost = min(sum(flow.escaped) / sum(flow.emitted), 1 - 1e-6)
+        lost = min((sum(flow.escaped) + sum(flow.blocked)) / sum(flow.emitted), 1 - 1e-6)
         # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
-        noise = lost / (1 - lost) / max(flow.rays * flow.first_share, 1)
+        first = flow.rays * flow.first_share * (GLANCE if self._problem.model.rays.lobes is None else 1)
+        noise = lost / (1 - lost) / max(first, 1)
         trust = 1 / (1 + noise * self._count)
         for light, more, shown, total in zip((direct, indirect), added, have, want):
             factors = [1 + trust * (w / h - 1) if h > 0 else 1.0 for w, h in zip(total, shown)]

@@ -167,14 +167,16 @@ class _Series:
         if sum(self.on_surfaces) > 0:
             powers.append(sum(self.on_surfaces))
             emitters.append(LeafEmitter(self.problem, self.power, powers[-1], self.how.numbering))
-        return list(zip(emitters, apportion(count, powers, 1)))
+        return [(emitter, n) for emitter, n in zip(emitters, apportion(count, powers, 1)) if n]
 
     def _shoot(self, count, progress):
         """Cast ``count`` rays and tally what arrives where: in all; straight, and focused (see `Flow`), if the first
         rays may come otherwise."""
         first, n = self.iteration == 0, len(self.problem.elements)
         tally = Tally(n, self.unshot, self.traces)
-        direct, focused = (Tally(n, self.unshot) if first and x else None for x in (self.traces, self.focuses))
+        direct, focused = (
+            Tally(n, self.unshot, self.traces) if first and x else None for x in (self.traces, self.focuses)
+        )
         landings = Landings(self.problem.exposure.slots)
         cast = self.rays - self.left
         for emitter, share in self._emitters(count):
