@@ -143,7 +143,9 @@ def test_a_filter_over_pixels_is_as_wide_as_the_film_s(name):
     rfilter = mi.load_dict({"type": name})
     reach = int(np.ceil(rfilter.radius() - 0.5))
     if reach < 1:
-        pytest.skip("one pixel is all there is")
+        image = np.random.default_rng(0).random((4, 4, 3))
+        assert denoise._filtered(image, rfilter) is image  # a pixel is all there is of it
+        return
     weight = denoise._over_pixels(rfilter, reach)
     x = np.linspace(-reach - 0.5, reach + 0.5, 2001)
     curve = np.array([float(rfilter.eval(float(y))[0]) for y in x])

@@ -119,7 +119,7 @@ def _attempts(
         return {"ours": [partial(_solved, scene, shading, *budget) for budget in ladder]} | traced
     curves = {"ours": False} | ({"ours, denoised": True} if cleans else {})
     return {
-        curve: [partial(_within, scene, shading, seconds, clean) for seconds in times]
+        curve: [partial(pictures_within, scene, shading, seconds, clean) for seconds in times]
         for curve, clean in curves.items()
     } | traced
 
@@ -143,32 +143,36 @@ def _curves(attempts: dict[str, list[Callable]], views: Views, progress: Callabl
 
 def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
     """One point of a curve: seconds and errors of an attempt at pictures of the views."""
-    start = _now()
+    start = now()
     images, more = attempt(views.sensors)
-    return {"seconds": _now() - start, **more, **views.error(images)}
+    return {"seconds": now() - start, **more, **views.error(images)}
 
 
-def _within(scene, shading, seconds, denoise, sensors):
+def pictures_within(
+    scene: "mi.Scene", shading: str, seconds: float, denoise: bool, sensors: "list[mi.Sensor]"
+) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Our pictures after so many seconds in all, and what they are made of."""
-    start, samples = _now(), []
+    start, samples = now(), []
     solution = solve(scene, seconds=SOLVING_SHARE * seconds)
-    more = {"elements": solution.stats["elements"], "rays": solution.stats["rays"], "solve_seconds": _now() - start}
+    more = {"elements": solution.stats["elements"], "rays": solution.stats["rays"], "solve_seconds": now() - start}
     images = []
     for number, sensor in enumerate(sensors):
-        left, seen = max(seconds - (_now() - start), 1e-3) / (len(sensors) - number), [0]
-        picture = solution.render(
-            sensor, shading=shading, denoise=denoise, seconds=left, show=lambda _, spp, seen=seen: seen.append(spp)
-        )
+        left, seen = max(seconds - (now() - start), 1e-3) / (len(sensors) - number), [0]
+        picture = solution.render(sensor, shading=shading, denoise=denoise, seconds=left, show=partial(_note, seen))
         images.append(np.array(picture)[..., :3])
         samples.append(seen[-1])
     return images, more | {"spp": float(np.mean(samples))}
 
 
+def _note(seen, image, samples):
+    seen.append(samples)
+
+
 def _solved(scene, shading, elements, rays, sensors):
     """Our pictures, and what the solution took."""
-    start = _now()
+    start = now()
     solution = solve(scene, elements=elements, rays=rays)
-    more = {"elements": solution.stats["elements"], "rays": rays, "solve_seconds": _now() - start}
+    more = {"elements": solution.stats["elements"], "rays": rays, "solve_seconds": now() - start}
     return [np.array(solution.render(s, spp=OUR_SPP, shading=shading))[..., :3] for s in sensors], more
 
 
@@ -177,7 +181,8 @@ def _traced(trace, scene, spp, sensors):
     return [trace(scene, sensor, spp) for sensor in sensors], {"spp": spp}
 
 
-def _now() -> float:
+def now() -> float:
+    """Seconds, when all that was asked of the device is done."""
     dr.sync_thread()
     return time.perf_counter()
 

@@ -1,11 +1,9 @@
 """A gallery: every scene by `path`, by us in a few seconds, and what is between the two."""
 
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -13,7 +11,7 @@ from ..core.color import srgb
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..scene import Model
-from ..solver import SOLVING_SHARE, solve
+from .bench import now, pictures_within
 from .metrics import compare
 from .records import make_folder
 from .reference import cached_reference, path_image
@@ -80,24 +78,28 @@ def _row(file, work, seconds, spp, denoise, progress):
         raise RadiosityError(f"{file.path} has no sensor: add one to the file")
     reference, _ = cached_reference(Model(scene), 0, work, spp, progress)
     halves = reference.halves()
-    _ours(scene, 0.5, denoise)  # compiles
-    start = _now()
-    image, elements, samples = _ours(scene, seconds, denoise)
-    taken = _now() - start
+
+    def ours(seconds):
+        return pictures_within(scene, "gather", seconds, denoise, scene.sensors()[:1])
+
+    ours(0.5)  # compiles
+    start = now()
+    (image,), made = ours(seconds)
+    taken = now() - start
     path_image(scene, scene.sensors()[0], 4)
-    start = _now()
+    start = now()
     path_image(scene, scene.sensors()[0], 4, seed=1)
-    count = max(1, round(4 * taken / max(_now() - start, 1e-3)))
-    start = _now()
+    count = max(1, round(4 * taken / max(now() - start, 1e-3)))
+    start = now()
     theirs = path_image(scene, scene.sensors()[0], count, seed=2)
-    path_seconds = _now() - start
+    path_seconds = now() - start
     truth = halves.mean(axis=0)
     difference = np.abs(srgb(image) - srgb(truth)) * TIMES_DIFFERENCE
     return {
         "scene": Path(file.path).name,
         "seconds": taken,
-        "elements": elements,
-        "samples": samples,
+        "elements": made["elements"],
+        "samples": round(made["spp"]),
         "error": compare(image, halves).rmse_a_clean,
         "mean": float(np.mean(image) / np.mean(truth)),
         "path_samples": count,
@@ -105,17 +107,6 @@ def _row(file, work, seconds, spp, denoise, progress):
         "path_error": compare(theirs, halves).rmse_a_clean,
         "pictures": [srgb(truth), srgb(image), np.minimum(difference, 255)],
     }
-
-
-def _ours(scene: "mi.Scene", seconds: float, denoise: bool) -> tuple[np.ndarray, int, int]:
-    """Our picture after so many seconds, with its elements and samples per pixel."""
-    start, seen = _now(), [0]
-    solution = solve(scene, seconds=SOLVING_SHARE * seconds)
-    left = max(seconds - (_now() - start), 1e-3)
-    image = solution.render(
-        shading="gather", denoise=denoise, seconds=left, show=lambda _, samples: seen.append(samples)
-    )
-    return np.array(image)[..., :3], solution.stats["elements"], seen[-1]
 
 
 def _text(row: dict[str, Any]) -> str:
@@ -140,8 +131,3 @@ def _smaller(picture, step):
     """Means of step × step pixels."""
     height, width = (n // step * step for n in picture.shape[:2])
     return picture[:height, :width].reshape(height // step, step, width // step, step, 3).mean(axis=(1, 3))
-
-
-def _now() -> float:
-    dr.sync_thread()
-    return time.perf_counter()

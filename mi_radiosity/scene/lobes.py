@@ -112,13 +112,13 @@ class Lobes:
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
         if rays.glossy:
             rough = on & is_glossy(bsdf)
-        if rays.glossy and highlights is not None:
+        if highlights is not None:
             share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
             pdf = dr.select(rough & ~smooth, sample.pdf, 0)
 
         shines = hit.traced & on_patch & (trail.bounced | camera)
         glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
-        if rays.glossy and highlights is not None:
+        if highlights is not None:
             glow += before * highlights.light(ctx, bsdf, si, random, rough)
         rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
         factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))

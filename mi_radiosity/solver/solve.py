@@ -41,12 +41,11 @@ def solve(
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: leaf elements wanted, reached to within 3, or 15 % where leaves share; or epsilon: the ε of the oracle.
-    Without either, 19,000 more
-    than the scene has patches, unless the oracle finds less to refine. Where fewer elements are asked for than there
-    are patches, neighbours share one irradiance (`Clusters`), as they do by default beyond 57,000. rays: rays that
-    carry the power and gather it, used exactly; by default 300 for each of the first 19,000 elements, and 20 for each
-    of all: light, not tessellation, decides what is needed. lines: random lines S per pair for the oracle. seed: any
-    integer; the same seed gives the same solution.
+    Without either, 19,000 more than the scene has patches, unless the oracle finds less to refine. Where fewer elements
+    are asked for than there are patches, neighbours share one irradiance (`Clusters`), as they do by default beyond
+    57,000. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
+    elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random lines S per pair
+    for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
     default, while `Shooting()` shoots it only. layers: keep the light of every lamp by itself, for `Solution.relight`;
     the rays are shared out by the lamps' power. seconds: choose elements and rays, where they are not given, so that it
@@ -65,8 +64,8 @@ def solve(
     clock.lap("scene")
     given = elements is not None
     if seconds is not None:
-        elements, rays = afford(model, seconds - clock.total(), elements if epsilon is None else None, rays)
-    wanted, shared = plan(model, elements if epsilon is None else None, epsilon)
+        elements, rays = afford(model, seconds - clock.total(), elements, rays)
+    wanted, shared = plan(model, elements, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights)
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
