@@ -119,7 +119,7 @@ def _solve_arguments(group):
         help="ks, mi, gmi, power, uniform or a plugin's, such as gmi:0.75 (default gmi)",
     )
     add("--alpha", type=float, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
-    wanted = "elements wanted, fewer than faces too (default: 19,000 more than the patches, 57,000 at most)"
+    wanted = "elements wanted, fewer than faces too (default: 19,000 more than the patches, 114,000 at most)"
     add("--elements", type=positive, metavar="N", help=wanted)
     add("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
     rays = "rays in all that carry power and gather it (default: 300 for each of 19,000 elements, 20 for each of all)"

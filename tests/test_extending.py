@@ -326,7 +326,7 @@ def test_pilot_and_transport_are_of_one_kind(cornell):
 
 def test_the_tail_of_shooting(cornell):
     """A small tail takes more iterations, and power is kept whatever it is."""
-    transports = (mr.Shooting(tail=tail, late=1) for tail in (0.5, 0.001))
+    transports = (mr.Shooting(tail=tail) for tail in (0.5, 0.001))
     short, long = (mr.solve(cornell, transport=transport, **BUDGET).stats for transport in transports)
     assert short["iterations"] < long["iterations"]
     for stats in (short, long):

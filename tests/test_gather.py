@@ -40,7 +40,7 @@ def reference(box):
 def test_all_rays_are_counted(solution):
     found = solution.stats
     assert found["rays"] == 400_000 == found["power_rays"] + found["gather_rays"]
-    assert 0.7 * 400_000 < found["gather_rays"] <= 0.8 * 400_000
+    assert 0.8 * 400_000 < found["gather_rays"] <= 0.9 * 400_000
 
 
 def test_every_line_counts():

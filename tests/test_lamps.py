@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from beside_path import compare
 from conftest import balance, diffuse, lamp, rectangle
 
 DOWN = mi.ScalarTransform4f().look_at([0.3, 0.2, 1.9], [0, 0, 0], [0, 1, 0])
@@ -79,30 +80,10 @@ def lit(name, **changes):
     return plate(lamp=rectangle(SHINING, bsdf=diffuse(), emitter=emitter))
 
 
-def picture(source, seed=0, spp=256, depth=-1):
-    """Mean of a picture by `path`, or of a solution."""
-    if isinstance(source, mr.Solution):
-        image = source.render(spp=64, seed=seed)
-    else:
-        image = mi.render(source, integrator=mi.load_dict({"type": "path", "max_depth": depth}), spp=spp, seed=seed)
-    return np.array(image).mean(axis=(0, 1))
-
-
-def agree(solution, truth, sigma=4, bias=0.005):
-    """Do the means agree to within ``sigma`` standard errors of `path` and ``bias``?"""
-    paths = np.array([picture(truth, seed) for seed in range(4)])
-    ours = picture(solution)
-    error = paths.std(axis=0, ddof=1) / 2
-    print(ours, paths.mean(axis=0), error)
-    return (np.abs(ours - paths.mean(axis=0)) <= sigma * error + bias * paths.mean(axis=0)).all()
-
-
 @pytest.mark.parametrize("name", [*SURFACES, *FREE[:-1]])  # `path` of Mitsuba 3.9 fails with the last one
 def test_pictures_agree_with_path(name):
-    truth = lit(name)
-    solution = mr.solve(truth, elements=3000, rays=400_000)
-    assert balance(solution) == pytest.approx(1, abs=2e-3)
-    assert agree(solution, truth)
+    solutions, _, _ = compare(lit(name), elements=3000, rays=400_000)
+    assert all(balance(solution) == pytest.approx(1, abs=2e-3) for solution in solutions)
 
 
 @pytest.mark.parametrize("name", FREE)
@@ -119,7 +100,7 @@ def test_power_arrives_where_lines_to_the_lamp_say(name):
     x, y, s, t = kronecker(dr.arange(mi.UInt32, n), zero + 1, zero)
     point = mi.Point3f(1.5 * (2 * x - 1), 2 * y - 1, 0) - model.patches.origin
     up = mi.Vector3f(0, 0, 1)
-    sampled, _ = light.lights_up(model.rays, point, up, s, t)
+    sampled, _, _ = light.lights_up(model.rays, point, up, s, t)
     assert shot == pytest.approx(np.array([dr.mean(h)[0] for h in sampled]), rel=0.01)
     if model.lights.sky_light:
         a, b, s, t = kronecker(dr.arange(mi.UInt32, n), zero + 2, zero)
@@ -139,7 +120,7 @@ def test_directionalarea_lights_what_is_straight_ahead():
     (light,) = solution.model.lights.free
     x, y, _, _ = kronecker(dr.arange(mi.UInt32, 1 << 16), mi.UInt32(0), mi.UInt32(0))
     point = mi.Point3f(1.5 * (2 * x - 1), 2 * y - 1, 0) - solution.model.patches.origin
-    H, _ = light.lights_up(solution.model.rays, point, mi.Vector3f(0, 0, 1), x, y)
+    H, _, _ = light.lights_up(solution.model.rays, point, mi.Vector3f(0, 0, 1), x, y)
     below = 4 * 0.6 * 0.4 - 0.4 * 0.6  # the block is under a part of the lamp
     assert dr.mean(H.z)[0] * 6 == pytest.approx(3 * below, rel=0.01)
 

@@ -8,6 +8,7 @@ from mi_radiosity.display import denoise, pixels
 from mi_radiosity.scene import Model
 from mi_radiosity.solver import cost
 from mi_radiosity.transport import Gatherer
+from mi_radiosity.transport.gather import Found
 
 import drjit as dr
 import mitsuba as mi
@@ -227,12 +228,9 @@ def test_looking_up_light_beside_walls_loses_none():
     patch = dr.gather(mi.UInt32, e.patch, leaf)
     u, v = e.patch_point(leaf, mi.Float(a.astype(np.float32)), mi.Float(b.astype(np.float32)))
 
-    class Hit:
-        pass
-
-    hit = Hit()
-    hit.patch, hit.u, hit.v = patch, u, v
-    found = np.array(gatherer._looked_up(hit, dr.full(mi.Bool, True, n * m)).x).reshape(n, m).mean(axis=1)
+    dark = mi.Color3f(0)
+    hit = Found(dark, dark, dark, leaf, patch, u, v, mi.Color3f(1))
+    found = np.array(gatherer.reflected_by(hit).x).reshape(n, m).mean(axis=1)
     want = np.array(dr.gather(mi.Float, e.reflectance.x * solution.irradiance().x, crossed))
     want = want * np.array(exposure.open_share(e, crossed))
     area = np.array(dr.gather(mi.Float, e.area, crossed))

@@ -99,11 +99,19 @@ class Dimmed(Light):
         direction, distance, irradiance = self._light.sample(point, s, t)
         return direction, distance, irradiance * self.color
 
+    @property
+    def may_be_sharp(self) -> bool:
+        return self._light.may_be_sharp
+
+    def is_sharp(self, direction: "mi.Vector3f") -> "mi.Bool":
+        return self._light.is_sharp(direction)
+
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
         return self._light.density(direction)
 
-    def lights_up(self, rays: Any, *places: Any, **options: Any) -> "tuple[mi.Color3f, mi.Color3f]":
-        return tuple(found * self.color for found in self._light.lights_up(rays, *places, **options))
+    def lights_up(self, rays: Any, *places: Any, **options: Any) -> "tuple[mi.Color3f, mi.Color3f, mi.Bool]":
+        shared, alone, sharp = self._light.lights_up(rays, *places, **options)
+        return shared * self.color, alone * self.color, sharp
 
     def fingerprint(self) -> bytes:
         return self._light.fingerprint()

@@ -18,6 +18,7 @@ from .state import parameters
 LIGHTS = Registry("emitter")
 LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
 SAMPLES = 1 << 18  # rays that a lamp's power is averaged over
+SHARP = 300 / (4 * np.pi)  # density over directions, 1/sr, of parts of a sky that are as small and bright as a sun
 
 
 class Light:
@@ -79,6 +80,15 @@ class Light:
         """Density of `sample` over directions, 1/sr, if rays that leave the scene see the lamp; else 0 (Float [n])."""
         return mi.Float(0)
 
+    @property
+    def may_be_sharp(self) -> bool:
+        """Is some of it as if from a point, so that its shadows are sharp, and no ray meets it by chance?"""
+        return not self.is_sky
+
+    def is_sharp(self, direction: "mi.Vector3f") -> "mi.Bool":
+        """Is it so, seen along directions (Bool [n])?"""
+        return dr.full(mi.Bool, self.may_be_sharp, dr.width(direction))
+
     def share_of_rays(self, direction: "mi.Vector3f", cosine: "mi.Float", rays_per_line: "float | None") -> "mi.Float":
         """The balance heuristic's weight of cosine-distributed rays that see the lamp, of which there are so many per
         `sample` (None: there are no samples) (Float [n])."""
@@ -96,16 +106,19 @@ class Light:
         t: "mi.Float",
         active: "mi.Bool | bool" = True,
         rays_per_line: float = 0.0,
-    ) -> "tuple[mi.Color3f, mi.Color3f]":
+        only_sharp: bool = False,
+    ) -> "tuple[mi.Color3f, mi.Color3f, mi.Bool]":
         """H at points x, relative to the patches' origin, with their normals: one `sample` each, weighed against the
-        rays that see the lamp, and by itself (two Color3f [n])."""
+        rays that see the lamp, and by itself (two Color3f [n]); and is it sharp light (Bool [n])?"""
         direction, distance, irradiance = self.sample(x + rays.patches.origin, s, t)
-        cosine = dr.dot(direction, normal)
+        cosine, sharp = dr.dot(direction, normal), self.is_sharp(direction)
         lit = active & (cosine > 0) & (dr.max(irradiance) > 0)
+        if only_sharp:
+            lit &= sharp
         start = x + normal * rays.patches.lift
         hidden = rays.blocked(start, start + direction * distance, lit)
         found = dr.select(lit & ~hidden, irradiance * cosine, 0)
-        return found * (1 - self.share_of_rays(direction, cosine, rays_per_line)), found
+        return found * (1 - self.share_of_rays(direction, cosine, rays_per_line)), found, sharp
 
 
 class Area(Light):
@@ -173,6 +186,14 @@ class Infinite(Free):
         "SunskyEmitter",
         "TimedSunskyEmitter",
     )
+
+    @property
+    def may_be_sharp(self) -> bool:
+        return self.emitter.class_name() != "ConstantBackgroundEmitter"
+
+    def is_sharp(self, direction: "mi.Vector3f") -> "mi.Bool":
+        """All of a lamp of one direction; of a sky the sun, and what else is like it."""
+        return self.density(direction) > SHARP if self.is_sky else super().is_sharp(direction)
 
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
         if not self.is_sky:

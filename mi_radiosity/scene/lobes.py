@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from ..core.arrays import NONE
 from ..core.points import ROUNDS
+from .gloss import Gloss
 
 ROULETTE = 5  # lobes after which a ray may end by chance
 MOST = 64  # lobes after which it ends
@@ -24,7 +25,7 @@ class Trail:
     theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
     the end included (it is ``coated``), and of lamps that lines from rough lobes have found, times the weight there,
     W/m². ``share``: of the lamp that the end is on, or of the sky, what those lines leave to the ray. ``rough``: the
-    first lobe on the way is such a one.
+    first lobe on the way is one that such lines look from.
     """
 
     valid: "mi.Bool"
@@ -40,12 +41,6 @@ class Trail:
     glow: "mi.Color3f"
     share: "mi.Float"
     rough: "mi.Bool"
-
-
-def is_glossy(bsdf: "mi.BSDFPtr") -> "mi.Bool":
-    """Have BSDFs rough lobes and no diffuse one, so that all they send on of a lamp is theirs (Bool [n])?"""
-    flags = bsdf.flags()
-    return mi.has_flag(flags, mi.BSDFFlags.Glossy) & ~mi.has_flag(flags, mi.BSDFFlags.Diffuse)
 
 
 class Lobes:
@@ -68,7 +63,7 @@ class Lobes:
         camera: the first surface's own light counts, too. highlights: how rough lobes see lamps; without, only by
         their own rays.
         """
-        ctx, n = mi.BSDFContext(mode), dr.width(ray.d)
+        ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
         alive, no = mi.Bool(active) & dr.full(mi.Bool, True, n), dr.zeros(mi.Bool, n)
         nought, black = dr.zeros(mi.Float, n), dr.zeros(mi.Color3f, n)
@@ -90,12 +85,12 @@ class Lobes:
         )
 
         def step(alive, ray, pdf, depth, random, trail):
-            return self._step(rays, ctx, camera, highlights, alive, ray, pdf, depth, random, trail)
+            return self._step(rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail)
 
         state = (alive, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
         return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
 
-    def _step(self, rays, ctx, camera, highlights, alive, ray, pdf, depth, random, trail):
+    def _step(self, rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail):
         """One more hit, of rays drawn with densities ``pdf`` where lines look for lamps as well, else 0."""
         prelim = rays.scene.ray_intersect_preliminary(ray, active=alive)
         hit, before = rays.locate(prelim, ray.d), trail.weight
@@ -103,23 +98,25 @@ class Lobes:
         s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         bsdf = si.bsdf(ray)
         sample, value = bsdf.sample(ctx, si, s, st, hit.traced)
+        parts = mi.Float(0), mi.Float(0)
+        if rays.glossy:
+            parts = gloss.shares(bsdf, si, hit.traced)
+            value = gloss.weigh(bsdf, si, sample, value, parts)
         value = dr.select(hit.traced & dr.isfinite(value), value, 0)
         drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
         on_patch = hit.patch != NONE
         coated = hit.traced & drawn & on_patch & (dr.max(value) > 0)
         on = hit.traced & ~coated
-        rough, share = dr.zeros(mi.Bool, dr.width(ray.d)), mi.Float(1)
+        rough, share = on & (parts[0] > 0), mi.Float(1)
         smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
-        if rays.glossy:
-            rough = on & is_glossy(bsdf)
         if highlights is not None:
             share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
-            pdf = dr.select(rough & ~smooth, sample.pdf, 0)
+            pdf = gloss.light(bsdf, si, sample.wo, parts[0], rough & ~smooth)[1]
 
         shines = hit.traced & on_patch & (trail.bounced | camera)
         glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
         if highlights is not None:
-            glow += before * highlights.light(ctx, bsdf, si, random, rough)
+            glow += before * highlights.light(gloss, parts[0], bsdf, si, random, hit.traced & (parts[0] > 0))
         rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
         factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that meets them as received, the others nothing.

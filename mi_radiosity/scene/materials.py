@@ -11,8 +11,8 @@ from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .faces import Faces
+from .gloss import Gloss, is_glossy
 from .lights import LIGHTS
-from .lobes import is_glossy
 from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
@@ -28,7 +28,7 @@ AT_ONCE = 1 << 22  # samples in one launch
 class Materials:
     """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
     ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]; ``glossy``: are
-    there rough lobes without a diffuse one?
+    there rough lobes?
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -106,10 +106,13 @@ class Materials:
         x, y, s, t = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO)))
         a, b, c, _ = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO, 1)))
         si, rho = self._faces.surface(face, *triangle(x, y)), []
-        wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
+        wi, gloss = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t)), Gloss(mi.TransportMode.Radiance)
         for side in (1, -1):
             si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
-            sample, value = si.bsdf().sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
+            bsdf = si.bsdf()
+            sample, value = bsdf.sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
+            if self.glossy:
+                value = gloss.weigh(bsdf, si, sample, value, gloss.shares(bsdf, si, dr.full(mi.Bool, True, len(k))))
             drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
             value = dr.select(drawn & dr.isfinite(value), value, 0)
             rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)

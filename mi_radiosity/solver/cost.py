@@ -16,7 +16,7 @@ RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEM
 SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
-SHARED = 3 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
+SHARED = 6 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
 PROBES = 1 << 19  # rays that are timed
 # Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY = 110e6, 2.5e3, 4e3, 24

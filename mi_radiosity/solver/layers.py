@@ -18,16 +18,17 @@ from ..transport.series import LEAST_RAYS
 
 Scales = Mapping[str | int, float | tuple[float, float, float]]  # of lamps, by name or number
 POWERS = ("emitted", "absorbed", "escaped", "unshot", "shown")  # by a transport; and absorbed of what is shown
-LIGHT = ("direct", "indirect", "caustic")  # of a Flow
-ARRAYS = ("direct", "indirect", "u", "v", "power", "scales")  # that an archive keeps, and caustic where there is some
+LIGHT = ("direct", "indirect", "caustic", "sharp")  # of a Flow; the last two where there is some
+ARRAYS = ("direct", "indirect", "u", "v", "power", "scales")  # that an archive keeps
 
 
 @dataclass(frozen=True)
 class Layers:
     """Light of every lamp as the scene has it, on one mesh.
 
-    lamps: who they are. elements: the mesh, with the emission of the scene. direct, indirect, caustic: irradiance, W/m²
-    (float32 [lamps, 3, elements]). u, v: landings [lamps, seats] (see `Landings`). power: W [POWERS, lamps, 3].
+    lamps: who they are. elements: the mesh, with the emission of the scene. direct, indirect, caustic, sharp:
+    irradiance, W/m² (float32 [lamps, 3, elements]). u, v: landings [lamps, seats] (see `Landings`). power: W [POWERS,
+    lamps, 3].
     scales: those of the solution that these layers belong to [lamps, 3].
     """
 
@@ -40,6 +41,7 @@ class Layers:
     power: np.ndarray
     scales: np.ndarray
     caustic: np.ndarray | None = None
+    sharp: np.ndarray | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,7 +97,7 @@ class Layers:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What an archive keeps."""
-        kept = ARRAYS if self.caustic is None else (*ARRAYS, "caustic")
+        kept = (*ARRAYS, *(name for name in LIGHT[2:] if getattr(self, name) is not None))
         return {"lamps": np.array(self.names)} | {f"layers_{name}": getattr(self, name) for name in kept}
 
     @staticmethod
@@ -109,8 +111,9 @@ class Layers:
                 f"the lamps were called {', '.join(data['lamps'])}, and are called {', '.join(lamps.names)} now: "
                 "solve the scene again"
             )
-        caustic = data.get("layers_caustic")
-        return Layers(lamps, elements, **{name: data[f"layers_{name}"] for name in ARRAYS}, caustic=caustic)
+        kept = {name: data[f"layers_{name}"] for name in ARRAYS}
+        caustic, sharp = (data.get(f"layers_{name}") for name in LIGHT[2:])
+        return Layers(lamps, elements, **kept, caustic=caustic, sharp=sharp)
 
 
 def solve_layers(

@@ -30,9 +30,10 @@ from ..transport.probe import probe
 from .field import Field
 from .layers import ARRAYS, Layers, Scales
 
-FORMAT = 4
+FORMAT = 5
 TREE = ("patch", "parent", "child", "place", "u0", "v0", "scale")
 COLORS = ("reflectance", "direct", "indirect")
+PARTS = ("caustic", "sharp")  # where there is some
 EXPOSURE = ("open_area", "crossed", "slot")
 
 
@@ -62,7 +63,8 @@ class Solution:
     W/m² (Color3f [elements]), straight from the lamps and all other; interior elements hold the area average.
     landings: where light came down on leaves that a wall crosses. stats: the numbers of the run (see README). layers:
     the light of every lamp by itself, if it was asked for. caustic: the part of ``indirect`` that only shooting finds
-    (see `Flow`): surfaces show it as sharp as elements are, and points in free space are not told of it.
+    (see `Flow`): surfaces show it as sharp as elements are, and points in free space are not told of it. sharp: the
+    part of ``direct`` that is as if from points (see `Flow`); who gathers light looks for that by himself.
     """
 
     model: Model
@@ -74,6 +76,7 @@ class Solution:
     stats: dict
     layers: Layers | None = None
     caustic: "mi.Color3f | None" = None
+    sharp: "mi.Color3f | None" = None
 
     def irradiance(
         self,
@@ -121,7 +124,10 @@ class Solution:
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
-            return self.elements.emission(dr.arange(mi.UInt32, len(self.elements))) + self._reflected()
+            return (
+                self.elements.emission(dr.arange(mi.UInt32, len(self.elements)))
+                + self.elements.reflectance * self.irradiance()
+            )
         where, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
         if len(where) == 0:
             return np.zeros((0, 3))
@@ -161,10 +167,10 @@ class Solution:
     @cached_property
     def gatherer(self) -> Gatherer:
         """What gathers irradiance at any places, by this solution's radiosity."""
-        return Gatherer(self.model, self.elements, self.exposure, self.landings, self._reflected())
-
-    def _reflected(self):
-        return self.elements.reflectance * self.irradiance()
+        light = self.irradiance() if self.sharp is None else self.irradiance() - self.sharp
+        reflected = self.elements.reflectance * light
+        looks = self.sharp is not None
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, reflected, looks)
 
     def leaves(self) -> Leaves:
         """Geometry and light of all leaves, neighbours after neighbours."""
@@ -250,8 +256,8 @@ class Solution:
         arrays |= {name: np.array(getattr(self.exposure, name)) for name in EXPOSURE}
         for name, color in zip(COLORS, (e.reflectance, self.direct, self.indirect)):
             arrays[name] = np.array(color, dtype=np.float32).reshape(3, -1)
-        if self.caustic is not None:
-            arrays["caustic"] = np.array(self.caustic, dtype=np.float32).reshape(3, -1)
+        parts = {name: getattr(self, name) for name in PARTS}
+        arrays |= {name: np.array(h, dtype=np.float32).reshape(3, -1) for name, h in parts.items() if h is not None}
         arrays |= self.layers.arrays() if self.layers else {}
         arrays |= {"landings": np.array([self.landings.u, self.landings.v]).reshape(2, -1)}
         with writing(path) as temporary, open(temporary, "wb") as file:
@@ -299,9 +305,9 @@ class Solution:
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)
-        caustic = owned_vectors(mi.Color3f, data["caustic"].T) if "caustic" in data else None
+        light = {name: owned_vectors(mi.Color3f, data[name].T) for name in PARTS if name in data}
         landings = Landings(slots, *data["landings"])
-        solution = Solution(model, elements, exposure, direct, indirect, landings, stats, caustic=caustic)
+        solution = Solution(model, elements, exposure, direct, indirect, landings, stats, **light)
         if "lamps" not in data:
             return solution
         layers = Layers.load(data, Lamps(model), elements)

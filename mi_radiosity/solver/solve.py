@@ -43,7 +43,7 @@ def solve(
     elements: leaf elements wanted, reached to within 3, or 15 % where leaves share; or epsilon: the ε of the oracle.
     Without either, 19,000 more than the scene has patches, unless the oracle finds less to refine. Where fewer elements
     are asked for than there are patches, neighbours share one irradiance (`Clusters`), as they do by default beyond
-    57,000. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
+    114,000. rays: rays that carry the power and gather it, used exactly; by default 300 for each of the first 19,000
     elements, and 20 for each of all: light, not tessellation, decides what is needed. lines: random lines S per pair
     for the oracle. seed: any integer; the same seed gives the same solution.
     transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
@@ -103,7 +103,7 @@ def solve(
     else:
         flow = carry(problem, rays)
         flows, power = [flow], dict(zip(POWERS, powers(problem, flow).sum(axis=1).tolist()))
-        light = {name: getattr(flow, name) for name in ("direct", "indirect", "caustic", "landings")}
+        light = {name: getattr(flow, name) for name in ("direct", "indirect", "caustic", "sharp", "landings")}
         light |= {"model": model, "elements": mesh}
     shot = sum((flow.shot or flow).rays for flow in flows)
     clock.lap("distribute")

@@ -28,6 +28,7 @@ class Batch:
     v: "mi.Float"
     doubtful: "mi.Bool"  # might start inside a solid, then goes nowhere
     starts: "mi.Bool"  # False for rays that start under another face
+    sharp: "mi.Bool"  # what lobes focus of them is found by no ray that looks for light
 
 
 def launches(count: int, at_once: int = AT_ONCE) -> "Iterator[mi.UInt32]":
@@ -65,10 +66,8 @@ class LeafEmitter:
     leaves, cosine-distributed, low-discrepancy in position and direction.
 
     numbering: `numbered_through` or `numbered_by_leaf`. landings: where light came down on crossed leaves, which send
-    it on from there; None for light of their own. even: share of the rays given to all leaves that have power alike.
+    it on from there; None for light of their own.
     """
-
-    unmet = False
 
     def __init__(
         self,
@@ -77,15 +76,11 @@ class LeafEmitter:
         total: float,
         numbering: Callable,
         landings: Landings | None = None,
-        even: float = 0,
     ) -> None:
         self.elements, self.leaves = problem.elements, problem.elements.leaves
         self._rays, self._exposure, self._landings = problem.model.rays, problem.exposure, landings
         self._power, self._numbering = power, numbering
         weight = power[0] + power[1] + power[2]
-        if even:
-            alike = dr.select(weight > 0, dr.opaque(mi.Float64, even * total), 0) / dr.count(weight > 0)
-            weight = weight * (1 - even) + alike
         self._distribution = Distribution(weight, total)
 
     def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
@@ -113,14 +108,15 @@ class LeafEmitter:
         each = at.spacing / (weight * mi.Float64(share))
         power = [dr.gather(mi.Float64, p, at.row) * each for p in self._power]
         origin, direction = self._rays.leave(patch, u, v, s, t)
-        return Batch(origin, direction, power, ray, patch, u, v, share < 1, self._rays.on_top(patch, u, v))
+        on_top = self._rays.on_top(patch, u, v)
+        return Batch(origin, direction, power, ray, patch, u, v, share < 1, on_top, mi.Bool(False))
 
 
 class LampEmitter:
-    """Sends the power of a lamp that is no surface. ``unmet``: no ray can meet it, unlike the sky."""
+    """Sends the power of a lamp that is no surface."""
 
     def __init__(self, light: Light) -> None:
-        self._light, self.unmet = light, not light.is_sky
+        self._light = light
 
     def batches(self, count: int, iteration: int, seed: int) -> Iterator[Batch]:
         """``count`` rays as Batches."""
@@ -130,4 +126,4 @@ class LampEmitter:
             power = [mi.Float64(p) / dr.opaque(mi.Float64, count) + dr.zeros(mi.Float64, n) for p in power]
             nowhere, at = dr.full(mi.UInt32, NONE, n), dr.zeros(mi.Float, n)
             yes = dr.full(mi.Bool, True, n)
-            yield Batch(origin, direction, power, ray, nowhere, at, at, ~yes, yes)
+            yield Batch(origin, direction, power, ray, nowhere, at, at, ~yes, yes, self._light.is_sharp(-direction))

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, opaque_index
-from ..core.points import Stream, kronecker, stream_seed, triangle
+from ..core.points import Stream, kronecker, stream_seed, triangle, uniform
 from ..mesh import Elements, Exposure
 from ..scene import Model
 from .highlights import Highlights
@@ -15,6 +15,27 @@ from .lamps import LampChoice
 from .landings import Landings
 
 LOOKS = 32  # points of a crossed leaf
+
+
+@dataclass
+class Found:
+    """What rays into the room have found, [n]: H of lamps that are surfaces, and of the sky; H of lobes that shine, and
+    of sharp light where rays end; and the point (patch, u, v) of a leaf that they end on, whose ρ H times ``weight`` is
+    the light that it adds, if it is in sight there."""
+
+    lamps: "mi.Color3f"
+    sky: "mi.Color3f"
+    glow: "mi.Color3f"
+    leaf: "mi.UInt32"  # NONE for rays that end on none
+    patch: "mi.UInt32"
+    u: "mi.Float"
+    v: "mi.Float"
+    weight: "mi.Color3f"
+
+    @property
+    def end(self) -> "tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]":
+        """Where they end."""
+        return self.leaf, self.patch, self.u, self.v
 
 
 @dataclass
@@ -30,16 +51,24 @@ class Gatherer:
     """Irradiance at points of a scene whose radiosity is known.
 
     reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses
-    a leaf that light is. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
+    a leaf that light is. looks: sharp light of lamps that are no surfaces is not in it, so rays look for it from where
+    they end: no oracle refines its shadows, and sun that comes in through a window is not to spread over whole
+    leaves. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
     an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
     so that no estimate exceeds their exitance however near they are.
     """
 
     def __init__(
-        self, model: Model, elements: Elements, exposure: Exposure, landings: Landings, reflected: "mi.Color3f"
+        self,
+        model: Model,
+        elements: Elements,
+        exposure: Exposure,
+        landings: Landings,
+        reflected: "mi.Color3f",
+        looks: bool = False,
     ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
-        self._exposure = exposure
+        self._exposure, self._looks = exposure, looks
         self._place(landings)
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
@@ -47,6 +76,7 @@ class Gatherer:
 
     def seeing(self, reflected: "mi.Color3f", landings: Landings) -> "Gatherer":
         """The same for other values of ρ H, and where that light is."""
+        dr.eval(reflected)
         other = copy.copy(self)
         other._reflected = reflected
         other._place(landings)
@@ -68,9 +98,10 @@ class Gatherer:
         u, v = e.patch_point(leaf, *triangle(x0, x1))
         asked = landings.any_on(slot, True) & rays.on_top(patch, u, v)
         seen = landings.in_sight(e, rays, leaf, slot, e.patches.above(patch, u, v), asked)
-        share = dr.block_sum(dr.select(seen, mi.Float(1 / LOOKS), 0), LOOKS)
+        count = dr.block_sum(dr.select(seen, mi.Float(1), 0), LOOKS)
         self._bright = dr.zeros(mi.Float, landings.slots)
-        more = self._exposure.open_share(e, leaves) / dr.maximum(share, 2 / LOOKS)
+        # Of n points k in sight: the mean of (n + 1) / (k + 1) is one over the share, that of n / k is more.
+        more = self._exposure.open_share(e, leaves) * (LOOKS + 1) / (count + 1)
         dr.scatter(self._bright, more, dr.gather(mi.UInt32, self._exposure.slot, leaves))
         dr.eval(self._bright)
 
@@ -89,19 +120,40 @@ class Gatherer:
         lot, s, t: uniform numbers that draw a lamp and a point of it; rays_per_line: c, how many `rays` there are per
         line, which find lamps as well.
         """
-        x, normal, rays = places.x, places.normal, self._model.rays
-        shared, alone = mi.Color3f(0), mi.Color3f(0)
-        if self._lamps.count:
-            lamp, density = self._lamps.draw(lot, places.leaf)
-            u, v = triangle(s, t)
-            F = rays.kernel_at(x, normal, lamp, u, v, active)
-            by_rays = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
-            lit = self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * F
-            shared, alone = lit / (density + by_rays), lit / density
+        found = self.lines_to_surfaces(places, lot, s, t, rays_per_line, active)
+        return tuple(a + b for a, b in zip(found, self.lines_to_free(places, s, t, rays_per_line, active)[:2]))
+
+    def lines_to_surfaces(
+        self,
+        places: Places,
+        lot: "mi.Float",
+        s: "mi.Float",
+        t: "mi.Float",
+        rays_per_line: float = 0.0,
+        active: "mi.Bool | bool" = True,
+    ) -> "tuple[mi.Color3f, mi.Color3f]":
+        """What `lines` find of lamps that are surfaces: one line looks at one of them."""
+        if self._lamps.count == 0:
+            return mi.Color3f(0), mi.Color3f(0)
+        lamp, density = self._lamps.draw(lot, places.leaf)
+        u, v = triangle(s, t)
+        F = self._model.rays.kernel_at(places.x, places.normal, lamp, u, v, active)
+        by_rays = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
+        lit = self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * F
+        return lit / (density + by_rays), lit / density
+
+    def lines_to_free(
+        self, places: Places, s: "mi.Float", t: "mi.Float", rays_per_line: float = 0.0, active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Color3f, mi.Color3f, mi.Color3f]":
+        """What `lines` find of lamps that are no surfaces, each of which a line looks at; and what of the first is
+        sharp light (three Color3f [n])."""
+        total = [mi.Color3f(0)] * 3
         for light in self._free:
-            found = light.lights_up(rays, x, normal, s, t, active, rays_per_line)
-            shared, alone = shared + found[0], alone + found[1]
-        return shared, alone
+            shared, alone, sharp = light.lights_up(
+                self._model.rays, places.x, places.normal, s, t, active, rays_per_line
+            )
+            total = [a + b for a, b in zip(total, (shared, alone, dr.select(sharp, shared, 0)))]
+        return tuple(total)
 
     def rays(
         self,
@@ -117,21 +169,71 @@ class Gatherer:
         number: UInt32 [n], seed: UInt32, what rays draw lobes by. rays_per_line: see `lines`; without lines, None.
         What rays meet behind lobes that are traced shines by itself, too.
         """
+        found = self.follow(places, direction, number, seed, rays_per_line, active)
+        return found.glow + self.reflected_by(found), found.lamps + found.sky
+
+    @property
+    def glows(self) -> bool:
+        """May rays find light that is neither of lamps nor of leaves?"""
+        return self._model.rays.lobes is not None or self._looks
+
+    def reflected_by(self, found: Found) -> "mi.Color3f":
+        """H from the leaves that rays have found (Color3f [n])."""
+        on_leaf = found.leaf != NONE
+        weight = found.weight * self.share_in_sight(found.leaf, found.patch, found.u, found.v, on_leaf)
+        return dr.select(on_leaf, weight * dr.gather(mi.Color3f, self._reflected, found.leaf, on_leaf), 0)
+
+    def follow(
+        self,
+        places: Places,
+        direction: "mi.Vector3f",
+        number: "mi.UInt32",
+        seed: "mi.UInt32",
+        rays_per_line: float | None = None,
+        active: "mi.Bool | bool" = True,
+    ) -> Found:
+        """What `rays` find, the light of leaves as links to them."""
         model, patches = self._model, self._model.patches
         origin = places.x + patches.origin + places.normal * patches.lift
         hit = model.rays.follow(origin, direction, number, seed, active=active, highlights=self.highlights)
         met = active & (hit.patch != NONE)
-        H = self._looked_up(hit, met)
+        leaf = dr.select(met, self._elements.leaf_at(hit.patch, hit.u, hit.v, met), NONE)
+        end = leaf, hit.patch, hit.u, hit.v
+        lit = self._by_sharp_light(hit, leaf, number, seed)
         emission = model.lights.at(patches, hit.patch, hit.u, hit.v, met)
         if model.rays.lobes is None:
             sky = self._sky(places, direction, active & ~hit.valid, rays_per_line)
-            return H, emission * self._share_of_rays(places, hit, met, rays_per_line) + sky
+            lamps = emission * self._share_of_rays(places, hit, met, rays_per_line)
+            return Found(lamps, sky, lit, *end, mi.Color3f(1))
         straight = met & ~hit.bounced
         lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
-        lamp += self._sky(places, direction, active & ~hit.valid & ~hit.bounced, rays_per_line)
+        sky = self._sky(places, direction, active & ~hit.valid & ~hit.bounced, rays_per_line)
         seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
-        seen += model.lights.sky(hit.direction, active & ~hit.valid & hit.bounced)
-        return dr.select(active, hit.glow + hit.weight * (H + seen * hit.share), 0), lamp
+        # Where the last lobe was smooth, only rays that are shot find a sun.
+        left_to_shooting = self.is_sharp_sky(hit.direction) & (hit.share == 1)
+        seen += model.lights.sky(hit.direction, active & ~hit.valid & hit.bounced & ~left_to_shooting)
+        glow = dr.select(active, hit.glow + hit.weight * (seen * hit.share + lit), 0)
+        return Found(lamp, sky, glow, *end, hit.weight)
+
+    def is_sharp_sky(self, direction: "mi.Vector3f") -> "mi.Bool":
+        """Is light of the sky sharp there, and left out of the leaves' (Bool [n])?"""
+        sky = self._model.lights.sky_light
+        if not self._looks or sky is None or not sky.may_be_sharp:
+            return mi.Bool(False)
+        return sky.is_sharp(direction)
+
+    def _by_sharp_light(self, hit, leaf, number, seed):
+        """ρ H of sharp light where rays end on leaves, if they are to look for it (Color3f [n])."""
+        H, met, patches = mi.Color3f(0), leaf != NONE, self._model.patches
+        if not self._looks:
+            return H
+        patch = dr.select(met, hit.patch, 0)
+        x, normal = patches.point(patch, hit.u, hit.v), dr.gather(mi.Vector3f, patches.normal, patch)
+        s, t = (uniform(number, seed ^ salt) for salt in (0x51AB1E, 0x0DDB411))
+        for light in self._free:
+            if light.may_be_sharp:
+                H += light.lights_up(self._model.rays, x, normal, s, t, met, only_sharp=True)[1]
+        return H * dr.gather(mi.Color3f, self._elements.reflectance, leaf, met)
 
     def _sky(self, places, direction, escaped, rays_per_line):
         """H from the sky that rays meet which go straight there, as far as lines do not find it (Color3f [n])."""
@@ -141,19 +243,20 @@ class Gatherer:
         share = lights.sky_light.share_of_rays(direction, dr.dot(places.normal, direction), rays_per_line)
         return lights.sky(direction, escaped) * share
 
-    def _looked_up(self, hit, met):
-        """ρ H where rays end; of leaves that walls cross, all of it on the side their light is on (Color3f [n])."""
-        e = self._elements
-        leaf = e.leaf_at(hit.patch, hit.u, hit.v, met)
-        H = dr.gather(mi.Color3f, self._reflected, leaf, met)
+    def share_in_sight(
+        self, leaf: "mi.UInt32", patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool"
+    ) -> "mi.Float":
+        """What points of leaves show of the leaf's light: of those that walls cross, all of it is on the side it came
+        down on (Float [n])."""
         if self._landings.slots == 0:
-            return H
-        slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, met)
-        crossed = met & (slot != NONE)
+            return mi.Float(1)
+        e = self._elements
+        slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
+        crossed = active & (slot != NONE)
         landed = self._landings.any_on(slot, crossed)
-        x = e.patches.above(dr.select(met, hit.patch, 0), hit.u, hit.v)
+        x = e.patches.above(dr.select(active, patch, 0), u, v)
         seen = self._landings.in_sight(e, self._model.rays, leaf, slot, x, landed)
-        return H * dr.select(landed, dr.select(seen, dr.gather(mi.Float, self._bright, slot, landed), 0), 1)
+        return dr.select(landed, dr.select(seen, dr.gather(mi.Float, self._bright, slot, landed), 0), 1)
 
     def _share_of_rays(self, places, hit, met, rays_per_line):
         """The balance heuristic's weight of rays that meet lamps, c F / (p + c F) (Float [n])."""

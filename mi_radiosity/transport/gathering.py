@@ -14,18 +14,21 @@ from ..mesh.hierarchy import pull
 from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
+from .links import Links
 from .problem import Flow, Known, Problem
 from .series import GLANCE, Shooting, Transport
 
 SHOOTING = Shooting()
 RAYS_PER_LINE = 2  # rays into the room per line to the lamps
 LEAST = 16  # lines per leaf, or half of the mean
+BOUNCES = 4  # that rays follow from leaf to leaf
 
 
 @dataclass(frozen=True)
 class Gathering(Transport):
-    """Leaves look for light: along lines to the lamps; then, when another transport has found the radiosity, starting
-    from what lines have found, along cosine-distributed rays into the room.
+    """Leaves look for light: along lines to the lamps; then, when another transport has found the radiosity roughly,
+    starting from what lines have found, along cosine-distributed rays into the room, which light is followed along
+    from leaf to leaf (`Links`).
 
     A gathered ray serves the leaf it is meant for, and where its power is seen; a ray that is shot lands where chance
     has it. Large leaves get more, by the fourth root of their area, which was found best. Where the budget has no
@@ -37,7 +40,7 @@ class Gathering(Transport):
     """
 
     first: Transport = SHOOTING
-    share: float = 0.8
+    share: float = 0.9
 
     def __call__(
         self,
@@ -75,8 +78,11 @@ class _Pass:
         self._open, self._keys = area / whole, problem.elements.key(first)
         dr.eval(self._open, self._keys)
         area = np.array(area)
-        # A line looks at one of the lamps that are surfaces, and at each of the others.
-        cost = RAYS_PER_LINE + len(lights.free) + bool(lights.exitance.any())
+        # A line looks at one of the lamps that are surfaces, and at each of the others; a ray, where it ends, at those
+        # of sharp light.
+        self._sharp_lamps = sum(light.may_be_sharp for light in lights.free)
+        self._line_cost, self._ray_cost = len(lights.free) + bool(lights.exitance.any()), 1 + self._sharp_lamps
+        cost = self._line_cost + RAYS_PER_LINE * self._ray_cost
         self._lines = _share_out(area**0.25, budget // cost)
         self._count = int(self._lines.sum())
         self.rays = cost * self._count
@@ -85,9 +91,10 @@ class _Pass:
         """Irradiance straight from the lamps, by lines to them."""
         e, exposure, model = self._problem.elements, self._problem.exposure, self._problem.model
         bound = [1e5 * self._most_from_lamps() * int(self._lines.max())] * 3
-        self._direct, self._alone = (ColorSums(len(self._lines), bound) for _ in range(2))
+        self._direct, self._sharp, self._alone = (ColorSums(len(self._lines), bound) for _ in range(3))
         self._landings = Landings(exposure.slots)
-        self._gatherer = Gatherer(model, e, exposure, Landings(0), dr.zeros(mi.Color3f, len(e)))
+        nothing = dr.zeros(mi.Color3f, len(e))
+        self._gatherer = Gatherer(model, e, exposure, Landings(0), nothing, self._sharp_lamps > 0)
         self._sample_all(1, self._alone)
         return Known(self._seen(), self._landings.settled())
 
@@ -97,27 +104,57 @@ class _Pass:
         reflected = e.reflectance * (pull(e, known.direct, exposure.open_area) + flow.indirect)
         self._gatherer = self._gatherer.seeing(reflected, known.landings.filled_by(flow.landings))
         most = self._most_from_lamps() + dr.max(flow.direct + flow.indirect, axis=None)[0]
-        indirect = ColorSums(len(self._lines), [1e5 * most * int(self._lines.max())] * 3)
+        glow = ColorSums(len(self._lines), [1e5 * most * int(self._lines.max())] * 3)
         self._before = flow.rays
-        self._sample_all(RAYS_PER_LINE, indirect)
-        light = dict(zip(("direct", "indirect"), self._scaled(flow, self._means(self._direct), self._means(indirect))))
+        lobes = self._problem.model.rays.lobes is not None
+        links = Links(self._starts(RAYS_PER_LINE), RAYS_PER_LINE * self._count, exposure, lobes)
+        self._sample_all(RAYS_PER_LINE, glow, links)
         landings = self._landings.settled().filled_by(flow.landings)
+        links.look(self._gatherer.seeing(reflected, landings))
+        direct, sharp = (self._means(sums) for sums in (self._direct, self._sharp))
+        indirect = self._bounced(links, glow, [d - s for d, s in zip(direct, sharp)], flow)
+        light = dict(zip(("direct", "indirect"), self._scaled(flow, direct, indirect)))
+        if self._sharp_lamps:
+            light["sharp"] = pull(e, sharp, exposure.open_area)
         return dataclasses.replace(flow, **light, landings=landings, rays=flow.rays + self.rays, shot=flow)
 
-    def _sample_all(self, each, sums):
-        """So many samples per line of all leaves, into ``sums`` and those of direct light."""
-        start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
-        line = sums is self._alone
-        cost = self.rays // self._count - RAYS_PER_LINE if line else 1
+    def _bounced(self, links, glow, direct, flow):
+        """Indirect light as rays have found it, from leaf to leaf, beginning with what was shot; ``direct`` is what
+        they do not look for where they end (3 Float64 [leaves])."""
+        e = self._problem.elements
+        leaves, rows = e.leaves, dr.arange(mi.UInt32, len(self._lines))
+        rho = _of(e.reflectance, leaves)
+        seen = mi.Color3f(*map(mi.Float, direct)) + (0 if flow.caustic is None else _of(flow.caustic, leaves))
+        shone, light = glow.gather(rows), _of(flow.indirect, leaves) + mi.Color3f(*map(mi.Float, direct))
+        for _ in range(BOUNCES):
+            reflected = dr.zeros(mi.Color3f, len(e))
+            dr.scatter(reflected, rho * light, leaves)
+            dr.eval(reflected)
+            indirect = self._averaged([g + s / RAYS_PER_LINE for g, s in zip(shone, links.sums(reflected))])
+            light = seen + mi.Color3f(*map(mi.Float, indirect))
+            dr.eval(indirect, light)
+        return indirect
+
+    def _starts(self, each):
+        """Where the samples of rows begin, so many per line (UInt32 [rows + 1])."""
+        return owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
+
+    def _sample_all(self, each, other, links=None):
+        """So many samples per line of all leaves: lines, or rays if there are ``links`` to keep (see `_sample`)."""
+        start, cost = self._starts(each), self._ray_cost if links else self._line_cost
         for sample in launches(self._count * each):
-            self._sample(sample, start, line, sums)
+            self._sample(sample, start, links, other)
             self.done += dr.width(sample) * cost
             self._progress(self._before + self.done)
 
     def _means(self, sums):
         """Irradiance of the open part of the leaves from sums of samples (3 Float64 [leaves])."""
-        lines, rows = mi.Float64(owned(mi.Float, self._lines)), dr.arange(mi.UInt32, len(self._lines))
-        means = [c / lines / self._open for c in sums.gather(rows)]
+        return self._averaged(sums.gather(dr.arange(mi.UInt32, len(self._lines))))
+
+    def _averaged(self, sums):
+        """Irradiance from sums over the lines of leaves (3 Float64 [rows] ─► [leaves])."""
+        lines = mi.Float64(owned(mi.Float, self._lines))
+        means = [c / lines / self._open for c in sums]
         return self._problem.clusters.spread(means) if self._problem.clusters else means
 
     def _seen(self):
@@ -162,9 +199,10 @@ class _Pass:
         free = sum(sum(light.power()) for light in model.lights.free) / model.patches.total_area
         return dr.max(model.patches.emission, axis=None)[0] + 1e3 * free
 
-    def _sample(self, sample, start, line, other):
-        """Add up samples (UInt32 [n]): lines to lamps if ``line``, else rays into the room. ``other`` sums what lines
-        find by themselves, and what rays find in the room."""
+    def _sample(self, sample, start, links, other):
+        """Add up samples (UInt32 [n]): lines to lamps without ``links``, else rays into the room. ``other`` sums what
+        lines find by themselves, and what lobes shine that rays find."""
+        line = links is None
         problem = self._problem
         e, rays, patches = problem.elements, problem.model.rays, problem.model.patches
         row = lower_bound(start, sample + 1) - 1
@@ -181,16 +219,33 @@ class _Pass:
         places = Places(patches.point(patch, u, v), dr.gather(mi.Vector3f, patches.normal, patch), leaf)
         if line:
             lot = lamp_lot(number, keys, seed, row)
-            lamps, found = self._gatherer.lines(places, lot, s, t, RAYS_PER_LINE, on_top)
+            lamps, found = self._gatherer.lines_to_surfaces(places, lot, s, t, RAYS_PER_LINE, on_top)
+            free, of_free, sharp = self._gatherer.lines_to_free(places, s, t, RAYS_PER_LINE, on_top)
+            lamps, found = lamps + free, found + of_free
         else:
             direction = cosine_direction(places.normal, s, t)
-            found, lamps = self._gatherer.rays(places, direction, sample, seed, RAYS_PER_LINE, on_top)
-            lamps, found = lamps / RAYS_PER_LINE, found / RAYS_PER_LINE
-        other.add(found, row, on_top)
+            met = self._gatherer.follow(places, direction, sample, seed, RAYS_PER_LINE, on_top)
+            lamps, shone = (met.lamps + met.sky) / RAYS_PER_LINE, met.glow / RAYS_PER_LINE
+            sharp = dr.select(self._gatherer.is_sharp_sky(direction), met.sky / RAYS_PER_LINE, 0)
+            found = shone + self._gatherer.reflected_by(met)
+        if line or self._gatherer.glows:
+            other.add(found if line else shone, row, on_top)
         self._direct.add(lamps, row, on_top)
-        lit = on_top & (dr.max(lamps + found) > 0)
+        if self._sharp_lamps:
+            self._sharp.add(sharp, row, on_top)
+        light = dr.sum(lamps + found)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
-        self._landings.offer(slot, u, v, sample ^ (0 if line else 0x80000000), lit & (slot != NONE))
+        if problem.exposure.slots:
+            dr.eval(slot, u, v, light, [] if line else [*met.end, met.weight])  # lest the rays be traced again
+        if not line:
+            links.keep(sample, met, on_top)
+        self._landings.offer(
+            slot, u, v, sample ^ (0 if line else 0x80000000), on_top & (light > 0) & (slot != NONE), light
+        )
+
+
+def _of(color, leaves):
+    return dr.gather(mi.Color3f, color, leaves)
 
 
 def _share_out(weight, total):

@@ -6,12 +6,13 @@ import mitsuba as mi
 from ..core.arrays import NONE
 from ..core.points import triangle
 from ..scene import Model
+from ..scene.gloss import Gloss
 from ..scene.rays import Hit
 from .lamps import LampChoice
 
 
 class Highlights:
-    """What rays that follow lobes ask for at surfaces that are rough and have no diffuse lobe.
+    """What rays that follow lobes ask for at surfaces that have rough ones.
 
     One line to a lamp that is a surface, drawn by power, and one to each of the others (Veach 1997, eq. 9.8).
     """
@@ -21,20 +22,22 @@ class Highlights:
 
     def light(
         self,
-        ctx: "mi.BSDFContext",
+        gloss: Gloss,
+        share: "mi.Float",
         bsdf: "mi.BSDFPtr",
         si: "mi.SurfaceInteraction3f",
         random: "mi.PCG32",
         active: "mi.Bool",
     ) -> "mi.Color3f":
-        """π L that lobes send on of the lamps, as lines find it, W/m² (Color3f [n])."""
+        """π L that rough lobes of a ``share`` (see `Gloss`) send on of the lamps, as lines find it, W/m² (Color3f
+        [n])."""
         rays, patches, lights = self._model.rays, self._model.patches, self._model.lights
         total = mi.Color3f(0)
 
         def add(direction, distance, light, density, on):
             """What becomes of light π L, over its density, from so far along a direction."""
-            value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(direction), on)
-            on &= (dr.max(value) > 0) & dr.isfinite(pdf)
+            value, pdf = gloss.light(bsdf, si, si.to_local(direction), share, on)
+            on = on & (dr.max(value) > 0)
             on &= ~rays.scene.ray_test(si.spawn_ray_to(si.p + direction * distance), active=on)
             weight = dr.select(density > 0, density / (density + pdf), 1)
             return dr.select(on, value * light * weight, 0)

@@ -24,18 +24,30 @@ class Landings:
         self.u, self.v = (mi.Float(nowhere) if x is None else owned(mi.Float, x) for x in (u, v))
         self._least = dr.full(mi.UInt64, 0xFFFFFFFFFFFFFFFF, SEATS * slots)
 
-    def offer(self, slot: "mi.UInt32", u: "mi.Float", v: "mi.Float", number: "mi.UInt32", active: "mi.Bool") -> None:
-        """Rays of a ``number`` each (UInt32 [n]) meet the points (u, v) of crossed leaves."""
+    def offer(
+        self,
+        slot: "mi.UInt32",
+        u: "mi.Float",
+        v: "mi.Float",
+        number: "mi.UInt32",
+        active: "mi.Bool",
+        light: "mi.Float | float" = 1.0,
+    ) -> None:
+        """Rays of a ``number`` each (UInt32 [n]) bring so much ``light`` to the points (u, v) of crossed leaves."""
         if self.slots == 0:
             return
-        dr.eval(slot, u, v, active)  # lest the rays be traced again
+        light = mi.Float(light)
+        dr.eval(slot, u, v, active, light)  # lest the rays be traced again
         offer = dr.compress(active)
         if dr.width(offer) == 0:
             return
-        # The least of well mixed numbers: any of them, but the same on any number of threads.
+        # The least of exponential numbers, drawn in proportion to light (Efraimidis and Spirakis 2006), and the same
+        # on any number of threads.
         lot = hash_pair(dr.gather(mi.UInt32, number, offer), 0)
         seat = SEATS * dr.gather(mi.UInt32, slot, offer) + lot % SEATS
-        lot = (mi.UInt64(lot) << 32) | mi.UInt64(dr.gather(mi.UInt32, number, offer))
+        light = dr.gather(mi.Float, light, offer) if dr.width(light) > 1 else light
+        time = -dr.log((mi.Float(lot >> 8) + 1) * 2.0**-24) / dr.maximum(light, 1e-30)
+        lot = (mi.UInt64(dr.reinterpret_array(mi.UInt32, time)) << 32) | mi.UInt64(dr.gather(mi.UInt32, number, offer))
         dr.scatter_reduce(dr.ReduceOp.Min, self._least, lot, seat, mode=dr.ReduceMode.Direct)
         drawn = dr.gather(mi.UInt64, self._least, seat) == lot
         for points, x in ((self.u, u), (self.v, v)):

@@ -49,7 +49,9 @@ class Flow:
 
     Irradiances are Color3f [elements]: right at the leaves, area averages at their ancestors. ``direct`` came straight
     from the lamps, ``indirect`` is all other light. ``caustic`` is the part of it that only shooting finds: light of
-    lamps that no ray can meet, such as `point`, which came through smooth lobes first (None where there is none).
+    lamps that no ray can meet, such as `point`, or not but by chance, such as the sun, which came through smooth lobes
+    first. ``sharp`` is the part of ``direct`` that is as if from points, of such lamps. Both are None where there is
+    none, or it is not known apart.
     """
 
     direct: "mi.Color3f"
@@ -64,4 +66,5 @@ class Flow:
     unshot: list[float]
     records: tuple[Record, ...] = ()
     caustic: "mi.Color3f | None" = None
+    sharp: "mi.Color3f | None" = None
     shot: "Flow | None" = None  # what the light was gathered from, if it was; its power is kept to the letter

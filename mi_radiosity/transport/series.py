@@ -49,16 +49,12 @@ class Shooting(Transport):
     is lost however large ρ is. Where the light straight from the lamps is `Known`, their rays only find how much of it
     there is in all, and what comes through lobes; a few do.
 
-    tail: share of the power below which the rest is summed in closed form, once an iteration brings the mean leaf less
-    than the share ``late`` of its light. even: share of the rays that leaves get
-    however little power they have: a room that is lit through a window has little of all. numbering: which points rays
-    have. deposit: who receives their power. records: keep the rays, to discover pairs with.
+    tail: share of the power below which the rest is summed in closed form. numbering: which points rays have. deposit:
+    who receives their power. records: keep the rays, to discover pairs with.
     Source: Bekaert, "Hierarchical and stochastic algorithms for radiosity", 1999.
     """
 
     tail: float = 0.0001
-    late: float = 0.005  # little of the sun comes into a room, and is not to end with what stays outside
-    even: float = 0.25
     numbering: Callable = numbered_through
     deposit: Callable = trusted
     records: bool = False
@@ -77,7 +73,7 @@ class Shooting(Transport):
         return series.flow()
 
 
-PILOT = Shooting(tail=0.1, late=1, even=0, numbering=numbered_by_leaf, deposit=spread, records=True)
+PILOT = Shooting(tail=0.1, numbering=numbered_by_leaf, deposit=spread, records=True)
 
 
 class _Series:
@@ -96,15 +92,14 @@ class _Series:
         n = dr.width(elements.leaves)
         self.direct, self.indirect, self.caustic = ([dr.zeros(mi.Float64, n) for _ in range(3)] for _ in range(3))
         self.traces = problem.model.rays.lobes is not None
-        self.focuses = self.traces and any(not light.is_sky for light in problem.model.lights.free)
+        self.focuses = self.traces and any(light.may_be_sharp for light in problem.model.lights.free)
         self.share, self.left, self.shot, self.iteration = first_share, rays, 0.0, 0
-        self.late = 1.0  # of the light of the mean leaf, what the last iteration brought
         self.landings, self.all_landings = None, Landings(problem.exposure.slots)
         self.records: list[Record] = []
 
     def iterate(self, progress):
         """Shoot what is unshot; what is reflected of it becomes the unshot power of the next iteration."""
-        little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted) and self.late <= self.how.late
+        little = sum(self.unshot) <= self.how.tail * self.share * sum(self.emitted)
         last = self.iteration > 0 and (self.iteration == ITERATIONS - 1 or little)
         share = self.share * (GLANCE if self.iteration == 0 and self.problem.known and not self.traces else 1)
         count = self.left if last else min(self.left, max(LEAST_RAYS, round(self.left * share)))
@@ -126,11 +121,6 @@ class _Series:
             self.indirect = [i - h for i, h in zip(self.indirect, self.direct)]
             self.caustic = self.caustic if focused is None else self._received(focused, scale)
         dr.eval(self.direct, self.indirect, self.power)
-        if self.how.late < 1:
-            brought, before = (
-                h[0] + h[1] + h[2] for h in (received, [d + i for d, i in zip(self.direct, self.indirect)])
-            )
-            self.late = totals([dr.select(before > 0, brought / before, 0)])[0] / dr.width(before)
         bins = (self.escaped, Tally.ESCAPED), (self.blocked, Tally.BLOCKED), (self.blocked, Tally.TAKEN)
         for lost, which in bins:
             lost[:] = [x + y * s * c for x, y, s, c in zip(lost, tally.lost(which), scale, closure)]
@@ -160,8 +150,7 @@ class _Series:
     def _emitters(self, count):
         """Who shoots in this iteration, and how many rays."""
         if self.iteration or not self.lamps:
-            even = self.how.even if self.iteration else 0
-            reflected = LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings, even)
+            reflected = LeafEmitter(self.problem, self.power, sum(self.unshot), self.how.numbering, self.landings)
             return [(reflected, count)]
         powers, emitters = [sum(power) for _, power in self.lamps], [emitter for emitter, _ in self.lamps]
         if sum(self.on_surfaces) > 0:
@@ -181,7 +170,7 @@ class _Series:
         cast = self.rays - self.left
         for emitter, share in self._emitters(count):
             for batch in emitter.batches(share, self.iteration, self.seed):
-                self._cast(batch, tally, landings, direct, focused if emitter.unmet else None)
+                self._cast(batch, tally, landings, direct, focused)
                 cast += dr.width(batch.number)
                 progress(cast)
         self.landings = landings.settled()
@@ -200,7 +189,7 @@ class _Series:
         if direct is not None:
             direct.add(batch, hit, receiver, batch.starts & goes & ~hit.bounced)
         if focused is not None:
-            focused.add(batch, hit, receiver, batch.starts & goes & hit.bounced & ~hit.rough)
+            focused.add(batch, hit, receiver, batch.starts & goes & batch.sharp & hit.bounced & ~hit.rough)
         if self.how.records:
             met = dr.select(straight(batch, hit), hit.patch, NONE)
             record = Record(met, hit.u, hit.v, batch.patch, batch.u, batch.v, pair)
