@@ -21,7 +21,7 @@ CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum",
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
-SOLID_SAMPLES, FACE_SAMPLES = 1 << 17, 1 << 8  # for the albedo of a shape, and of a face of a textured one
+SOLID_SAMPLES, FACE_SAMPLES = 1 << 15, 1 << 8  # for the albedo of a shape, and of a face of a textured one
 AT_ONCE = 1 << 22  # samples in one launch
 
 

@@ -15,7 +15,7 @@ from ..scene import Model
 from ..transport import Problem, Transport
 from ..transport.problem import Record
 
-GROWTH = 0.1  # of the leaves may split in one wave,
+GROWTH = 0.2  # of the leaves may split in one wave,
 LEAST_SPLITS = 64  # or so many
 STEP = 1 / 4  # by which the level comes down, above which pairs split
 RENEW = 4  # pilot rays are cast anew when the mesh has grown by this factor

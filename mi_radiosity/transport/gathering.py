@@ -236,7 +236,7 @@ class _Pass:
         light = dr.sum(lamps + found)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
         if problem.exposure.slots:
-            dr.eval(slot, u, v, light, [] if line else [*met.end, met.weight])  # lest the rays be traced again
+            dr.eval(slot, u, v, on_top, light, [] if line else [*met.end, met.weight])  # lest the rays be traced again
         if not line:
             links.keep(sample, met, on_top)
         self._landings.offer(
