@@ -163,6 +163,15 @@ class Distribution:
         return mi.Float64(dr.gather(mi.UInt64, self.weight, number)) / dr.opaque(mi.Float64, self.whole)
 
 
+def row_keys(columns: np.ndarray) -> np.ndarray:
+    """One integer for each row of integers [n, m], the same for rows that are the same (int64 [n])."""
+    mixed = np.zeros(len(columns), dtype=np.uint64)
+    for column in columns.T:
+        mixed = (mixed ^ column.astype(np.int64).astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return (mixed >> np.uint64(1)).astype(np.int64)
+
+
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Labels of ``count`` things, the same for those that links a[k], b[k] connect (int [count])."""
     label, before = np.arange(count), None

@@ -66,7 +66,7 @@ def _apart(model, atlas, where):
 def _surface_of(model):
     """A number for the flat surface of every patch, and its side [patches]."""
     every = np.arange(model.patches.count)
-    return 2 * surfaces(model.faces.corners, model.faces.normal)[face_of(model, every)] + is_back(model, every)
+    return 2 * surfaces(model.faces.vertex, model.faces.normal)[face_of(model, every)] + is_back(model, every)
 
 
 def _planes(model, surface, wall, tolerance):

@@ -83,7 +83,7 @@ def shape_grid(model: Model, name: str, spacing: float | None = None) -> Grid:
     if not len(chosen):
         raise RadiosityError(f"the shape '{name}' has no area: nothing can be measured on it")
     corners, normal = faces.corners[chosen], faces.normal[chosen]
-    group = surfaces(corners, normal)
+    group = surfaces(faces.vertex[chosen], normal)
     size = np.ptp(corners.reshape(-1, 3), axis=0)
     step = _checked_spacing(spacing, size.max())
     _checked_count(int(faces.area[chosen].sum() / step**2))

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, ColorSums, components, lower_bound_within, owned, totals
+from ..core.arrays import NONE, ColorSums, components, lower_bound_within, owned, row_keys, totals
 from ..scene.faces import Faces
 from .elements import Elements
 from .exposure import Exposure
@@ -46,7 +46,7 @@ class Clusters:
         face, back = np.array(p.face)[patch], np.array(p.back).astype(np.int64)[patch]
         centre = faces.corners[face].mean(axis=1) - faces.corners.min(axis=(0, 1))
         bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS).astype(np.int64)
-        kind = _mixed(np.column_stack([faces.shape[face], back, bins]))
+        kind = row_keys(np.column_stack([faces.shape[face], back, bins]))
         kind = np.where(lone, -1 - np.arange(len(face)), kind)  # like no other
         a, b = _neighbours(faces, face, back, ~(lone | crossed))
         a, b = (ends[kind[a] == kind[b]] for ends in (a, b))
@@ -57,7 +57,7 @@ class Clusters:
             return components(len(face), a[joined], b[joined])
 
         def near(cell):
-            return _mixed(np.column_stack([kind, np.where(lone[:, None], 0, cell)]))
+            return row_keys(np.column_stack([kind, np.where(lone[:, None], 0, cell)]))
 
         for label_of in (connected, near):
             label, count = _search(lambda size, of=label_of: of(np.floor(centre / size).astype(np.int64)), size, wanted)
@@ -119,21 +119,10 @@ def _search(label_at, size, wanted):
     return best
 
 
-def _mixed(columns):
-    """One integer for each row of integers [n, m], the same for rows that are the same (int64 [n])."""
-    mixed = np.zeros(len(columns), dtype=np.uint64)
-    for column in columns.T:
-        mixed = (mixed ^ column.astype(np.int64).astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    return (mixed >> np.uint64(1)).astype(np.int64)
-
-
 def _neighbours(faces, face, back, chosen):
     """Pairs of ``chosen`` rows whose faces, on one side, share an edge (two int [links])."""
     rows = np.flatnonzero(chosen)
-    corners = np.round((faces.corners[face[rows]] - faces.centre).reshape(-1, 3), 9) + 0.0
-    _, vertex = np.unique(corners, axis=0, return_inverse=True)
-    vertex = vertex.reshape(len(rows), 3).astype(np.int64)
+    vertex = faces.vertex[face[rows]]
     ends = np.stack([vertex, np.roll(vertex, -1, axis=1)]).reshape(2, -1)
     key = (ends.min(axis=0) << 32 | ends.max(axis=0)) * 2 + np.repeat(back[rows], 3)
     owner = np.repeat(rows, 3)

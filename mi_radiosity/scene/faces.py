@@ -1,11 +1,13 @@
 """Faces of a Mitsuba scene, as NumPy arrays."""
 
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import owned
+from ..core.arrays import owned, row_keys
 from ..core.errors import RadiosityError
 from .tessellate import tracing_scene
 
@@ -19,7 +21,8 @@ class Faces:
     over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
     ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
     corners) and ``rank`` (its place in an order that only geometry decides); ``centre`` [3] of the
-    scene; ``smooth``: some shapes have vertex normals.
+    scene; ``smooth``: some shapes have vertex normals; ``vertex`` [faces, 3]: numbers of their corners, the same where
+    positions are the same to the bit.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -68,6 +71,11 @@ class Faces:
         shading = np.array(si.sh_frame.n, dtype=np.float64).reshape(3, n).T
         self.flipped = (shading * self.normal).sum(axis=1) < 0
         self.normal[self.flipped] *= -1
+
+    @cached_property
+    def vertex(self) -> np.ndarray:
+        bits = np.ascontiguousarray(self.corners.reshape(-1, 3) + 0.0, dtype=np.float32).view(np.uint32)
+        return np.unique(row_keys(bits), return_inverse=True)[1].reshape(-1, 3).astype(np.int64)
 
     def surface(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.SurfaceInteraction3f":
         """Mitsuba's surface interaction at points (u, v) of faces (UInt32, Float, Float [n])."""

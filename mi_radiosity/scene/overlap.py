@@ -106,7 +106,7 @@ def find_overlaps(
 
 def _precedence(faces, present, exitance, reflectance):
     """Place of every side in the order in which points belong to sides (int [2 · faces])."""
-    surface = surfaces(faces.corners, faces.normal)
+    surface = surfaces(faces.vertex, faces.normal)
     size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
     first = np.full(surface.max() + 1, len(faces))
     np.minimum.at(first, surface, faces.rank)
@@ -141,6 +141,8 @@ class _Triangles:
 
     def near_plane(self, f: np.ndarray, g: np.ndarray) -> np.ndarray:
         """Is a corner of the smaller face near the plane of the larger one (bool [n])? Most pairs end here."""
+        if len(f) == 0:
+            return np.zeros(0, dtype=bool)
         f, g = self._larger_first(f, g)
         return self._read(dr.abs(self._height(f, g, 0)) <= self._tolerance)
 
@@ -178,7 +180,7 @@ class _Triangles:
         return self._read(meet)
 
     def _larger_first(self, f, g):
-        f, g = mi.UInt32(f.astype(np.uint32)), mi.UInt32(g.astype(np.uint32))
+        f, g = mi.UInt32(f), mi.UInt32(g)
         larger = dr.gather(mi.Float64, self._area, f) >= dr.gather(mi.Float64, self._area, g)
         return dr.select(larger, f, g), dr.select(larger, g, f)
 
@@ -216,7 +218,7 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
     The first is of the size of the second at least.
     """
     low, high = low - low.min(axis=0) - tolerance, high - low.min(axis=0) + tolerance
-    level = np.frexp((high - low).max(axis=1))[1]
+    level, faces = np.frexp((high - low).max(axis=1))[1], faces.astype(np.uint32)
     for size in np.unique(level[faces]):
         # Faces no larger than a cell are in eight cells at most.
         small = faces[level[faces] <= size]
@@ -233,27 +235,24 @@ def _boxes_that_meet(low, high, faces, tolerance, likely):
         keys, there = np.concatenate(keys), np.concatenate(there)
         largest = np.flatnonzero(level[there] == size)
         largest = largest[np.argsort(keys[largest])]
-        start = np.searchsorted(keys[largest], keys)
-        count = np.searchsorted(keys[largest], keys, side="right") - start
+        start, end = (np.searchsorted(keys[largest], keys, side) for side in ("left", "right"))
+        start[largest] = np.arange(len(largest)) + 1  # of two as large, one looks at the other
+        count, ordered = end - start, there[largest]
         for part in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // CHUNK)) + 1):
             each = count[part]
             g = np.repeat(there[part], each)
-            f = there[
-                largest[np.repeat(start[part], each) + np.arange(len(g)) - np.repeat(np.cumsum(each) - each, each)]
-            ]
-            near = ((f < g) | (level[g] < size)) & likely(f, g)  # first, as few pass
+            f = ordered[np.repeat(start[part] - np.cumsum(each) + each, each) + np.arange(len(g))]
+            near = likely(f, g) & (f != g)  # first, as few pass
             f, g = f[near], g[near]
             shared = np.minimum(high[f], high[g]) - np.maximum(low[f], low[g]) - 2 * tolerance
             near = (shared > -tolerance).all(axis=1) & ((shared > tolerance / 2).sum(axis=1) > 1)
             yield f[near], g[near]
 
 
-def surfaces(corners: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions
-    (int [faces])."""
-    n = len(corners)
-    _, vertex = np.unique(np.round(corners.reshape(-1, 3), 12), axis=0, return_inverse=True)
-    vertex = vertex.reshape(n, 3).astype(np.int64)
+def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions;
+    from the numbers of their corners [faces, 3] (int [faces])."""
+    n = len(vertex)
     tail, head, face = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel(), np.repeat(np.arange(n), 3)
     along, against = tail << 32 | head, head << 32 | tail
     order = np.argsort(along, kind="stable")
