@@ -18,8 +18,8 @@ MOST = 4  # times the default rays: more add less to a picture than camera sampl
 FEWEST = 1 / 32  # of the default elements and rays
 SHARED = 6 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
 PROBES = 1 << 19  # rays that are timed
-# Bytes, measured: of Mitsuba; of a patch; of an element more than those, with its pairs; of a ray in a launch.
-PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY = 110e6, 2.5e3, 4e3, 24
+# Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
+PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY, PER_LINK = 110e6, 2.5e3, 4e3, 24, 26
 # Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
 WORK, LINES = 2, 640
 
@@ -46,7 +46,9 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     start = time.perf_counter()
     _trace(model)
     ray, more = (time.perf_counter() - start) / PROBES, count - model.patches.count
-    memory = PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE)
+    memory = (
+        PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE) + PER_LINK * rays
+    )
     return Cost(shared or count, rays, memory, ray * (WORK * rays + LINES * more))
 
 
