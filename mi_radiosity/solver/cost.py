@@ -17,7 +17,9 @@ SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
 SHARED = 6 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
-PROBES = 1 << 19  # rays that are timed
+PROBES = 1 << 18  # rays that are timed
+RUN = 32  # of them leave from one patch, as most rays of a solve have a neighbour there
+FOLLOWED = 0.5  # of the rays go on through lobes; the others are lines
 # Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY, PER_LINK = 110e6, 2.5e3, 4e3, 24, 26
 # Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
@@ -35,21 +37,20 @@ class Cost:
 
 
 def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
-    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two.
+    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two or three.
 
-    Time is a multiple of what some rays take that are traced here and now.
+    Time is a multiple of what some rays take that are traced here and now, straight and through lobes.
     """
     leaves, shared = plan(model, elements, None)
     count = leaves or model.patches.count
     rays = rays or default_rays(shared or count)
-    _trace(model)  # once before, as kernels are compiled
-    start = time.perf_counter()
-    _trace(model)
-    ray, more = (time.perf_counter() - start) / PROBES, count - model.patches.count
+    more, cast = count - model.patches.count, model.rays
+    line = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
+    lobes = 0 if cast.lobes is None else max(_seconds(model, cast.follow) - line, 0)
     memory = (
         PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE) + PER_LINK * rays
     )
-    return Cost(shared or count, rays, memory, ray * (WORK * rays + LINES * more))
+    return Cost(shared or count, rays, memory, line * (WORK * rays + LINES * more) + lobes * FOLLOWED * rays)
 
 
 def default_rays(elements: int) -> int:
@@ -85,11 +86,19 @@ def afford(
     return elements, rays or round(share * usual.rays)
 
 
-def _trace(model):
+def _seconds(model, follow):
+    """What a ray takes."""
+    _trace(model, follow)  # once before, as kernels are compiled
+    start = time.perf_counter()
+    _trace(model, follow)
+    return (time.perf_counter() - start) / PROBES
+
+
+def _trace(model, follow):
     """Trace cosine-distributed rays from all over the scene, neighbours after neighbours as a solve does."""
     n = dr.arange(mi.UInt32, PROBES)
     u, v, s, t = kronecker(n, opaque_index(0), opaque_index(0))
-    patch = mi.UInt32((mi.UInt64(n) * mi.UInt64(opaque_index(model.patches.count))) // PROBES)
-    hit = model.rays.follow(*model.rays.leave(patch, *triangle(u, v), s, t), n, opaque_index(0))
+    patch = mi.UInt32((mi.UInt64(n // RUN * RUN) * mi.UInt64(opaque_index(model.patches.count))) // PROBES)
+    hit = follow(*model.rays.leave(patch, *triangle(u, v), s, t), n, opaque_index(0))
     dr.eval(hit.patch, hit.u)
     dr.sync_thread()
