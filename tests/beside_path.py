@@ -26,10 +26,10 @@ def pixels_of_shapes(scene):
     return masks, [None, *(ids.get(int(s), "") for s in shown)]
 
 
-def compare(scene, bias=0.01, shading="gather", depth=-1, aside=("", 0.0), **budget):
+def compare(scene, bias=0.01, shading="gather", depth=-1, aside=None, **budget):
     """Solve and show a scene RUNS times, with other seeds, and as often by `path`; the means must be the same to
-    ``bias``, but for what is left to chance at a doubt of DOUBT in all (Welch's t, Bonferroni). ``aside``: the id of a
-    shape that is allowed another bias.
+    ``bias``, that of all of the picture to half of it, but for what is left to chance at a doubt of DOUBT in all
+    (Welch's t, Bonferroni). ``aside``: ids of shapes that are allowed another bias, and theirs.
 
     Returns the solutions, and the means of both [runs, shapes, 3].
     """
@@ -44,6 +44,7 @@ def compare(scene, bias=0.01, shading="gather", depth=-1, aside=("", 0.0), **bud
     error = np.hypot(*(x.std(axis=0, ddof=1) / RUNS**0.5 for x in (ours, true)))
     sure = stats.t.ppf(1 - DOUBT / (2 * error.size), RUNS - 1)
     off, want = np.abs(ours.mean(axis=0) - true.mean(axis=0)), true.mean(axis=0)
-    allowed = np.array([aside[1] if name == aside[0] else bias for name in names])[:, None]
+    biases = {None: bias / 2} | (aside or {})
+    allowed = np.array([biases.get(name, bias) for name in names])[:, None]
     assert (off <= allowed * want + sure * error).all(), (ours.mean(axis=0) / want, error / want)
     return solutions, ours, true

@@ -46,7 +46,7 @@ def box(material):
 def test_pictures_agree_with_path(material):
     """The picture and every wall in it, in every channel, to 1 %; energy kept to 1 %."""
     solutions, _, _ = compare(
-        box(material), aside=("large-box", ASIDE.get(material, 0.01)), elements=2000, rays=300_000
+        box(material), aside={"large-box": ASIDE.get(material, 0.01)}, elements=2000, rays=300_000
     )
     assert np.mean([balance(solution) for solution in solutions]) == pytest.approx(1, abs=0.01)
 

@@ -95,7 +95,7 @@ class _Pass:
         self._landings = Landings(exposure.slots)
         nothing = dr.zeros(mi.Color3f, len(e))
         self._gatherer = Gatherer(model, e, exposure, Landings(0), nothing, self._sharp_lamps > 0)
-        self._sample_all(1, self._alone)
+        self._sample_all(self._alone)
         return Known(self._seen(), self._landings.settled())
 
     def look_around(self, flow: Flow, known: Known) -> Flow:
@@ -108,7 +108,7 @@ class _Pass:
         self._before = flow.rays
         lobes = self._problem.model.rays.lobes is not None
         links = Links(self._starts(RAYS_PER_LINE), RAYS_PER_LINE * self._count, exposure, lobes)
-        self._sample_all(RAYS_PER_LINE, glow, links)
+        self._sample_all(glow, links)
         landings = self._landings.settled().filled_by(flow.landings)
         links.look(self._gatherer.seeing(reflected, landings))
         direct, sharp = (self._means(sums) for sums in (self._direct, self._sharp))
@@ -124,8 +124,9 @@ class _Pass:
         e = self._problem.elements
         leaves, rows = e.leaves, dr.arange(mi.UInt32, len(self._lines))
         rho = _of(e.reflectance, leaves)
-        seen = mi.Color3f(*map(mi.Float, direct)) + (0 if flow.caustic is None else _of(flow.caustic, leaves))
-        shone, light = glow.gather(rows), _of(flow.indirect, leaves) + mi.Color3f(*map(mi.Float, direct))
+        direct = mi.Color3f(*map(mi.Float, direct))
+        seen = direct + (0 if flow.caustic is None else _of(flow.caustic, leaves))
+        shone, light = glow.gather(rows), _of(flow.indirect, leaves) + direct
         for _ in range(BOUNCES):
             reflected = dr.zeros(mi.Color3f, len(e))
             dr.scatter(reflected, rho * light, leaves)
@@ -139,9 +140,10 @@ class _Pass:
         """Where the samples of rows begin, so many per line (UInt32 [rows + 1])."""
         return owned(mi.UInt32, np.concatenate([[0], np.cumsum(self._lines) * each]))
 
-    def _sample_all(self, each, other, links=None):
-        """So many samples per line of all leaves: lines, or rays if there are ``links`` to keep (see `_sample`)."""
-        start, cost = self._starts(each), self._ray_cost if links else self._line_cost
+    def _sample_all(self, other, links=None):
+        """Samples of all leaves: their lines, or rays if there are ``links`` to keep (see `_sample`)."""
+        each, cost = (RAYS_PER_LINE, self._ray_cost) if links else (1, self._line_cost)
+        start = links.start if links else self._starts(each)
         for sample in launches(self._count * each):
             self._sample(sample, start, links, other)
             self.done += dr.width(sample) * cost

@@ -22,8 +22,9 @@ class Links:
     """
 
     def __init__(self, start: "mi.UInt32", count: int, exposure: Exposure, weighs: bool) -> None:
-        self._start, self._leaf = start, dr.full(mi.UInt32, NONE, count)
-        self._exposure, self._at_walls = exposure, []  # type: ignore[var-annotated]
+        self.start, self._leaf = start, dr.full(mi.UInt32, NONE, count)
+        self._exposure = exposure
+        self._at_walls: list[list] = []  # numbers and ends of rays, launch by launch
         self._weight = dr.zeros(mi.Color3f, count) if weighs or exposure.slots else None
 
     def keep(self, number: "mi.UInt32", found: Found, active: "mi.Bool") -> None:
@@ -49,9 +50,9 @@ class Links:
 
     def sums(self, reflected: "mi.Color3f") -> "list[mi.Float64]":
         """Σ_k w_k (ρ H)_l(k) of every row, from ρ H of the elements (Color3f [elements] ─► 3 Float64 [rows])."""
-        rows, lanes = dr.width(self._start) - 1, opaque_index(LANES)
+        rows, lanes = dr.width(self.start) - 1, opaque_index(LANES)
         lane = dr.arange(mi.UInt32, LANES * rows)
-        first, end = (dr.gather(mi.UInt32, self._start, lane // lanes + k) for k in (0, 1))
+        first, end = (dr.gather(mi.UInt32, self.start, lane // lanes + k) for k in (0, 1))
 
         def add(k, total):
             leaf = dr.gather(mi.UInt32, self._leaf, k)
