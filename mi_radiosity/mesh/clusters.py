@@ -67,7 +67,8 @@ class Clusters:
 
     @staticmethod
     def _from_labels(label: np.ndarray, area: np.ndarray) -> "Clusters":
-        _, of = np.unique(label, return_inverse=True)
+        _, first, of = np.unique(label, return_index=True, return_inverse=True)
+        of = np.argsort(np.argsort(first))[of]  # in an order that Mitsuba's order of shapes does not decide
         member = np.argsort(of, kind="stable")
         start = np.searchsorted(of[member], np.arange(of.max() + 2))
         until = owned(mi.Float64, np.cumsum(area[member]))

@@ -103,8 +103,9 @@ class Materials:
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
-        x, y, s, t = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO)))
-        a, b, c, _ = kronecker(k % each, k // each, opaque_index(stream_seed(0, Stream.ALBEDO, 1)))
+        key = owned(mi.UInt32, self._faces.rank[faces])  # not Mitsuba's number of the face, which varies
+        x, y, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
+        a, b, c, _ = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO, 1)), k // each)
         si, rho = self._faces.surface(face, *triangle(x, y)), []
         wi, gloss = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t)), Gloss(mi.TransportMode.Radiance)
         for side in (1, -1):
