@@ -376,6 +376,7 @@ def test_loading_leaves_the_model_alone(tmp_path):
     model = Model(edited)
     fewer = Model(edited, model.patches.sides[:-1])
     mr.solve(fewer, **BUDGET).save(tmp_path / "fewer.npz")
+    assert model.fingerprint  # worked out when it is asked for
     before, patches = copy.copy(vars(model)), model.patches
     loaded = mr.Solution.load(tmp_path / "fewer.npz", model)
     assert loaded.model is not model and loaded.model.patches.count == patches.count - 1

@@ -174,10 +174,24 @@ def row_keys(columns: np.ndarray) -> np.ndarray:
 
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Labels of ``count`` things, the same for those that links a[k], b[k] connect (int [count])."""
-    label, before = np.arange(count), None
-    while before is None or (label != before).any():
-        before = label.copy()
-        np.minimum.at(label, a, label[b])
-        np.minimum.at(label, b, label[a])
-        label = label[label]
-    return label
+    a, b, label = owned(mi.UInt32, a), owned(mi.UInt32, b), dr.arange(mi.UInt32, count)
+    while dr.width(a):
+        ends = dr.gather(mi.UInt32, label, a), dr.gather(mi.UInt32, label, b)
+        apart = ends[0] != ends[1]
+        a, b = (dr.gather(mi.UInt32, x, dr.compress(apart)) for x in (a, b))
+        # Roots are joined to the least that they are linked to; others, to their roots.
+        dr.scatter_reduce(dr.ReduceOp.Min, label, dr.minimum(*ends), dr.maximum(*ends), apart)
+        label = _roots(label)
+        dr.eval(a, b, label)
+    return np.array(label).astype(np.int64)
+
+
+@dr.syntax
+def _roots(label: "mi.UInt32") -> "mi.UInt32":
+    """Where chains of labels end (UInt32 [n])."""
+    root = mi.UInt32(label)
+    above = dr.gather(mi.UInt32, label, root)
+    while above != root:
+        root = mi.UInt32(above)
+        above = dr.gather(mi.UInt32, label, root)
+    return root

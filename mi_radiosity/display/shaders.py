@@ -123,7 +123,9 @@ class Gather(Shader):
         super().__init__(solution)
         self._gatherer = solution.gatherer
         # What no sample can find is shown as it was shot.
-        self._caustic = None if solution.caustic is None else Field(solution, solution.caustic)
+        caustic = solution.caustic
+        some = caustic is not None and dr.any(caustic > 0, axis=None)
+        self._caustic = Field(solution, caustic) if some else None
 
     def irradiance(self, look: Look) -> "mi.Color3f":
         lamps, room = self._samples(look)

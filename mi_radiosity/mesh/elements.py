@@ -175,13 +175,20 @@ class Tree(Elements):
     def _mean_reflectance(self, patch, u0, v0, scale):
         """ρ averaged over four points of each element (Color3f)."""
         face, back = dr.gather(mi.UInt32, self.patches.face, patch), dr.gather(mi.Bool, self.patches.back, patch)
-        total = mi.Color3f(0)
-        for a, b in ((1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3), (1 / 3, 1 / 3)):
-            total += self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
         # Where other lobes are traced, ρ is one number per patch.
-        return dr.select(
-            self._materials.is_traced(face), dr.gather(mi.Color3f, self.patches.reflectance, patch), total / 4
+        result = dr.gather(mi.Color3f, self.patches.reflectance, patch)
+        plain = dr.compress(~self._materials.is_traced(face) & dr.full(mi.Bool, True, dr.width(face)))
+        if dr.width(plain) == 0:
+            return result
+        k = dr.arange(mi.UInt32, 4 * dr.width(plain))
+        face, back, u0, v0, scale = (
+            dr.gather(type(x), x, dr.gather(mi.UInt32, plain, k // 4)) for x in (face, back, u0, v0, scale)
         )
+        a, b = (dr.select(k % 4 == which, 2 / 3, dr.select(k % 4 == 3, 1 / 3, 1 / 6)) for which in (1, 2))
+        rho = self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
+        dr.eval(rho)
+        dr.scatter(result, mi.Color3f(*(dr.block_sum(c, 4) / 4 for c in rho)), plain)
+        return result
 
 
 def mean_exitance(

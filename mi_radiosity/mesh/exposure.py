@@ -13,6 +13,7 @@ from .hierarchy import mark, sum_up
 from .subdivision import NODES
 
 GLANCE, LOOK = 8, 64  # points per leaf: of all leaves, and of those with a covered point
+FEWEST, MANY = 2, 1 << 19  # points of the first kind per leaf, where there are more than so many
 LEAST = 1 / 128  # no open share is smaller, so that nothing divides by zero
 TUCK = 2.0**-14  # how far inside of its element a node is when something is looked for between it and others
 
@@ -56,7 +57,8 @@ class Exposure:
 
 def _open_area(elements, rays, seed):
     """Area that is not covered, of leaves, and sums for their ancestors (Float [elements])."""
-    doubtful = dr.compress(_covered_share(elements, rays, elements.leaves, GLANCE, seed) > 0)
+    glance = max(FEWEST, min(GLANCE, MANY // dr.width(elements.leaves)))
+    doubtful = dr.compress(_covered_share(elements, rays, elements.leaves, glance, seed) > 0)
     if dr.width(doubtful) == 0:
         return elements.area
     doubtful = dr.gather(mi.UInt32, elements.leaves, doubtful)

@@ -58,6 +58,7 @@ class Lamps:
         """The model with the lamps' emission times ``scales`` [lamps, 3]; all else, and its fingerprint, as it is."""
         factor, free = np.vstack([scales, np.ones(3)]), list(zip(self._free, scales[self._on_surface :]))
         model, rays = copy.copy(self.model), copy.copy(self.model.rays)
+        model.fingerprint = self.model.fingerprint  # not that of dimmed lamps
         emission = owned_vectors(mi.Color3f, self._emission * factor[self._of_patch])
         model.patches = rays.patches = replace(self.model.patches, emission=emission)
         dimmed: list[Light] = [Dimmed(light, scale) for light, scale in free if scale.any()]

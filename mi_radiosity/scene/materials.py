@@ -21,7 +21,9 @@ CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum",
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
-SOLID_SAMPLES, FACE_SAMPLES = 1 << 15, 1 << 8  # for the albedo of a shape, and of a face of a textured one
+SOLID_SAMPLES = 1 << 15  # for the albedo of a shape
+FACE_SAMPLES, LEAST = 1 << 8, 1 << 6  # of a face of a textured one, and if there are many
+MANY = 1 << 20  # samples of all such faces
 AT_ONCE = 1 << 22  # samples in one launch
 
 
@@ -67,14 +69,22 @@ class Materials:
     def _mean(self, faces, points):
         """ρ averaged over points of diffuse faces [2 sides, faces, 3]."""
         n, third = len(faces), mi.Float(1 / 3)
-        face, rho = owned(mi.UInt32, faces), np.zeros((2, n, 3))
-        for k in range(points):
-            spread = triangle(*(mi.Float(x) for x in ((k + 0.5) / points, (k * 7 % points + 0.5) / points)))
-            u, v = (x + dr.zeros(mi.Float, n) for x in ((third, third) if points == 1 else spread))
-            for side in range(2):
-                value = self.reflectance_at(face, u, v, dr.full(mi.Bool, side == 1, n))
-                rho[side] += np.array(value, dtype=np.float64).reshape(3, n).T / points
-        return rho
+        face = owned(mi.UInt32, faces)
+
+        def step(k, front, back):
+            at = (k + 0.5) / points, ((k * 7) % opaque_index(points) + 0.5) / points
+            u, v = (third, third) if points == 1 else triangle(*(mi.Float(x) for x in at))
+            si = self._faces.surface(face, u + dr.zeros(mi.Float, n), v)
+            sides = []
+            for total, z in ((front, 1.0), (back, -1.0)):
+                si.wi = mi.Vector3f(0, 0, z)
+                sides.append(total + mi.Color3f(si.bsdf().eval_diffuse_reflectance(si)))
+            return k + 1, *sides
+
+        state = dr.zeros(mi.UInt32, n), dr.zeros(mi.Color3f, n), dr.zeros(mi.Color3f, n)
+        _, *totals = dr.while_loop(state, lambda k, *_: k < points, step)
+        dr.eval(totals)
+        return np.array([np.array(total, dtype=np.float64).reshape(3, n).T / points for total in totals])
 
     def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Do faces have lobes that are traced (Bool [n])?"""
@@ -88,7 +98,8 @@ class Materials:
         first = np.searchsorted(shape, np.arange(len(self.traced)))
         solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
         various = np.flatnonzero((self.traced & textured)[shape])
-        for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, FACE_SAMPLES, False)):
+        each = max(LEAST, min(FACE_SAMPLES, MANY // max(len(various), 1)))
+        for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, each, False)):
             for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
                 albedo = self._albedo(part, samples) if len(part) else np.zeros((2, 0, 3))
                 for rho, side in zip(albedo, self.rho):
@@ -116,6 +127,7 @@ class Materials:
                 value = gloss.weigh(bsdf, si, sample, value, gloss.shares(bsdf, si, dr.full(mi.Bool, True, len(k))))
             drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
             value = dr.select(drawn & dr.isfinite(value), value, 0)
+            dr.eval(value)  # in one go: sums one by one would draw all again
             rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
         return np.array(rho)
 

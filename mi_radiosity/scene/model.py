@@ -1,6 +1,8 @@
 """The scene as the solver sees it."""
 
 import hashlib
+from functools import cached_property
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -36,7 +38,7 @@ class Model:
         self.faces = Faces(scene)
         self.materials = Materials(self.faces)
         self.lights = Lights(self.faces, required=lit)
-        self.fingerprint = self._fingerprint()
+        self._named = self._parameters()
         overlaps = self._find_overlaps()
         self.unreached = 0
         if sides is None:
@@ -102,16 +104,21 @@ class Model:
             "where they do, a lamp or else the smaller surface is taken to be on top"
         ]
 
-    def _fingerprint(self):
+    @cached_property
+    def fingerprint(self) -> str:
         digest, f = hashlib.sha256(), self.faces
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
-        for light in self.lights.free:
-            digest.update(light.fingerprint())
-        first = np.full(len(f.parts), len(f))
-        np.minimum.at(first, f.shape, f.rank)
+        digest.update(self._named)
+        return digest.hexdigest()
+
+    def _parameters(self):
+        """What there is to know by name of lamps that are no surfaces, and of lobes that are traced, as it is now."""
+        f, found = self.faces, [light.fingerprint() for light in self.lights.free]
+        ends = np.searchsorted(f.shape, np.arange(len(f.parts) + 1))
+        first = np.array([f.rank[start:end].min(initial=len(f)) for start, end in pairwise(ends)])
         for number in np.argsort(first, kind="stable"):
             if self.materials.traced[number]:
-                digest.update(str(first[number]).encode() + parameters(f.parts[number].shape.bsdf()))
-        return digest.hexdigest()
+                found.append(str(first[number]).encode() + parameters(f.parts[number].shape.bsdf()))
+        return b"".join(found)

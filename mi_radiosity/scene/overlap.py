@@ -6,12 +6,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import components, owned, owned_vectors
+from ..core.arrays import components, opaque_index, owned, owned_vectors
 from ..core.points import coordinates
 from .faces import Faces
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
+CORNERS = 8  # of a box
+GUESS = 12  # pairs of faces that are near each other, per face
+FINEST = 30  # a grid has up to 2^30 cells along an axis
 LATTICE = 8  # points along a side that show whether a face is covered
 
 
@@ -121,35 +124,64 @@ def coplanar_pairs(
     corners: np.ndarray, normal: np.ndarray, area: np.ndarray, sound: np.ndarray, tolerance: float
 ) -> np.ndarray:
     """Ordered pairs (f, g) of ``sound`` faces in one plane whose interiors meet (two int [pairs])."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    faces, found = _Triangles(corners, normal, area, tolerance), [np.zeros((0, 2), dtype=np.int64)]
-    for f, g in _boxes_that_meet(low, high, np.flatnonzero(sound), tolerance, faces.near_plane):
-        meet = faces.meet(f, g)
-        found.append(np.column_stack([f[meet], g[meet]]))
+    chosen = np.flatnonzero(sound)
+    if len(chosen) == 0:
+        return np.zeros((2, 0), dtype=np.int64)
+    faces, found = _Triangles(corners[chosen], normal[chosen], area[chosen], tolerance), [np.zeros((0, 2), np.int64)]
+    f, g = _Grid(faces).pairs()
+    for start in range(0, dr.width(f), CHUNK):
+        part = opaque_index(start) + dr.arange(mi.UInt32, min(CHUNK, dr.width(f) - start))
+        ends = [dr.gather(mi.UInt32, x, part) for x in (f, g)]
+        meet = dr.compress(faces.meet(*ends))
+        found.append(np.column_stack([chosen[np.array(dr.gather(mi.UInt32, x, meet))] for x in ends]))
     pairs = np.concatenate(found)
-    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    return pairs[np.lexsort(pairs.T[::-1])].T
 
 
 class _Triangles:
-    """Faces on the device: many pairs are looked at, and few are left. The larger of two knows its plane best."""
+    """Faces on the device: many pairs are looked at, and few are left. The larger of two knows its plane best.
+
+    ``low``, ``high``: their boxes, the tolerance larger, from the origin on (three Float64 [faces] each); ``level``:
+    they are no larger than 2^level m (int [faces]).
+    """
 
     def __init__(self, corners: np.ndarray, normal: np.ndarray, area: np.ndarray, tolerance: float) -> None:
-        corners = corners - (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
-        self._corners = [[owned(mi.Float64, corners[:, k, axis]) for axis in range(3)] for k in range(3)]
+        low, high = (which(which(corners[:, 0], corners[:, 1]), corners[:, 2]) for which in (np.minimum, np.maximum))
+        origin = low.min(axis=0) - tolerance
+        size = np.maximum(np.maximum(*(high - low).T[:2]), (high - low)[:, 2]) + 2 * tolerance
+        self.level = np.frexp(size)[1]
+        self.level = np.maximum(self.level, np.frexp((high.max(axis=0) - origin).max())[1] - FINEST)
+        self.low = [owned(mi.Float64, low[:, axis] - origin[axis] - tolerance) for axis in range(3)]
+        self.high = [owned(mi.Float64, high[:, axis] - origin[axis] + tolerance) for axis in range(3)]
+        self._corners = [[owned(mi.Float64, corners[:, k, axis] - origin[axis]) for axis in range(3)] for k in range(3)]
         self._normal = [owned(mi.Float64, normal[:, axis]) for axis in range(3)]
         self._area, self._tolerance = owned(mi.Float64, area), dr.opaque(mi.Float64, tolerance)
+        first = corners[:, 0] - origin
+        self._first = owned(mi.Float64, np.column_stack([first, area]).ravel())
+        self._plane = owned(mi.Float64, np.column_stack([normal, -(normal * first).sum(axis=1)]).ravel())
 
-    def near_plane(self, f: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """Is a corner of the smaller face near the plane of the larger one (bool [n])? Most pairs end here."""
-        if len(f) == 0:
-            return np.zeros(0, dtype=bool)
-        f, g = self._larger_first(f, g)
-        return self._read(dr.abs(self._height(f, g, 0)) <= self._tolerance)
+    def look(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "tuple[mi.Vector4d, mi.Vector4d]":
+        """A corner and the area of faces, and their planes."""
+        return tuple(dr.gather(mi.Vector4d, x, face, active) for x in (self._first, self._plane))
 
-    def meet(self, f: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """Do faces lie in one plane, and share more than the tolerance in it (bool [n])? By separating lines."""
-        if len(f) == 0:
-            return np.zeros(0, dtype=bool)
+    def near_plane(self, one: "tuple[mi.Vector4d, mi.Vector4d]", other: "tuple[mi.Vector4d, mi.Vector4d]") -> "mi.Bool":
+        """Is a corner of the smaller face near the plane of the larger one (Bool [n])? Most pairs end here."""
+        heights = [n.x * p.x + n.y * p.y + n.z * p.z + n.w for (p, _), (_, n) in ((other, one), (one, other))]
+        return dr.abs(dr.select(one[0].w >= other[0].w, *heights)) <= self._tolerance
+
+    def boxes_meet(self, f: "mi.UInt32", g: "mi.UInt32", active: "mi.Bool") -> "mi.Bool":
+        """Do the boxes of faces meet, not only at an edge (Bool [n])?"""
+        wide = mi.UInt32(0)
+        for low, high in zip(self.low, self.high):
+            ends = dr.minimum(*(dr.gather(mi.Float64, high, x, active) for x in (f, g)))
+            shared = ends - dr.maximum(*(dr.gather(mi.Float64, low, x, active) for x in (f, g))) - 2 * self._tolerance
+            active &= shared > -self._tolerance
+            wide += dr.select(shared > 0.5 * self._tolerance, mi.UInt32(1), 0)
+        return active & (wide > 1)
+
+    def meet(self, f: "mi.UInt32", g: "mi.UInt32") -> "mi.Bool":
+        """Do faces lie in one plane, and share more than the tolerance in it (Bool [n])? By separating lines."""
         f, g = self._larger_first(f, g)
         meet = mi.Bool(True)
         for k in range(3):
@@ -177,10 +209,9 @@ class _Triangles:
                     ends.append((dr.minimum(a, dr.minimum(b, c)), dr.maximum(a, dr.maximum(b, c))))
                 (low_p, high_p), (low_q, high_q) = ends
                 meet &= (low_p < high_q - margin) & (low_q < high_p - margin)
-        return self._read(meet)
+        return meet
 
     def _larger_first(self, f, g):
-        f, g = mi.UInt32(f), mi.UInt32(g)
         larger = dr.gather(mi.Float64, self._area, f) >= dr.gather(mi.Float64, self._area, g)
         return dr.select(larger, f, g), dr.select(larger, g, f)
 
@@ -191,8 +222,94 @@ class _Triangles:
             for x, x0, n in zip(self._corners[k], self._corners[0], self._normal)
         )
 
-    def _read(self, which):
-        return np.array(which).astype(bool)
+
+class _Grid:
+    """Finds faces near each other. Each lies in those cells that its box meets, of a grid as fine as it is large, and
+    looks there, and in all coarser grids, for faces of their size. Cells of one key only cost time."""
+
+    def __init__(self, triangles: _Triangles) -> None:
+        self._triangles = triangles
+        levels, own = np.unique(triangles.level, return_inverse=True)
+        self._first = owned(mi.UInt32, own)  # grid of a face
+        self._grids, self._scale = opaque_index(len(levels)), owned(mi.Float64, 2.0**-levels)
+        bits = len(own).bit_length() + 1
+        self._shift = opaque_index(32 - bits)
+        found, faces = [], []
+        face = dr.arange(mi.UInt32, len(own))
+        for corner in range(CORNERS):
+            cell, there = self._cell(face, self._first, mi.UInt32(corner))
+            rows = dr.compress(there)
+            found.append(np.array(dr.gather(mi.UInt32, self._key(cell, self._first), rows)))
+            faces.append(np.array(rows))
+        keys = np.concatenate(found)
+        order = np.argsort(keys, kind="stable")
+        self._there = owned(mi.UInt32, np.concatenate(faces)[order])
+        self._start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(np.bincount(keys, minlength=2**bits))]))
+
+    def pairs(self) -> "tuple[mi.UInt32, mi.UInt32]":
+        """Pairs of faces that are near each other, each of them once, in any order (two UInt32 [pairs])."""
+        room = GUESS * dr.width(self._first)
+        while True:
+            f, g = (dr.zeros(mi.UInt32, room) for _ in range(2))
+            count = dr.zeros(mi.UInt32, 1)
+            dr.eval(self._look(count, f, g), count, f, g)
+            if count[0] <= room:
+                return tuple(dr.gather(mi.UInt32, x, dr.arange(mi.UInt32, count[0])) for x in (f, g))
+            room = count[0]
+
+    @dr.syntax
+    def _look(self, count: "mi.UInt32", f: "mi.UInt32", g: "mi.UInt32") -> "mi.UInt32":
+        """Write the pairs of all faces to f and g, as far as they are large enough, and ``count`` them."""
+        face, first, room = (
+            dr.arange(mi.UInt32, dr.width(self._first)),
+            mi.UInt32(self._first),
+            opaque_index(dr.width(f)),
+        )
+        step, own = CORNERS * self._first, self._triangles.look(face)
+        while step < CORNERS * self._grids:
+            grid = step // CORNERS
+            cell, there = self._cell(face, grid, step % CORNERS)
+            key = self._key(cell, grid)
+            place = dr.gather(mi.UInt32, self._start, key, there)
+            end = dr.gather(mi.UInt32, self._start, key + 1, there)
+            while place < end:
+                other = dr.gather(mi.UInt32, self._there, place)
+                # Of two in one grid one looks at the other.
+                wanted = (dr.gather(mi.UInt32, self._first, other) == grid) & ((grid > first) | (other < face))
+                wanted &= self._triangles.near_plane(own, self._triangles.look(other, wanted))
+                if wanted:
+                    near = self._triangles.boxes_meet(face, other, self._counts_here(face, other, grid, cell))
+                    at = dr.scatter_inc(count, mi.UInt32(0), near)
+                    near &= at < room
+                    dr.scatter(f, face, at, near)
+                    dr.scatter(g, other, at, near)
+                place += 1
+            step += 1
+        return step
+
+    def _counts_here(self, face, other, grid, cell):
+        """Does the box that two faces share begin in this cell of several that both are in (Bool [n])?"""
+        scale, here = dr.gather(mi.Float64, self._scale, grid), mi.Bool(True)
+        for low, c in zip(self._triangles.low, cell):
+            here &= mi.UInt32(dr.maximum(*(dr.gather(mi.Float64, low, x) for x in (face, other))) * scale) == c
+        return here
+
+    def _cell(self, face, grid, corner):
+        """The cell of a grid that a corner of the boxes of faces lies in, and has it another cell than the corners
+        before it (three UInt32, Bool [n])?"""
+        scale, cell, there = dr.gather(mi.Float64, self._scale, grid), [], mi.Bool(True)
+        for axis, (low, high) in enumerate(zip(self._triangles.low, self._triangles.high)):
+            a, b = (mi.UInt32(dr.gather(mi.Float64, x, face) * scale) for x in (low, high))
+            upper = (corner & (1 << axis)) != 0
+            there &= ~upper | (a != b)
+            cell.append(dr.select(upper, b, a))
+        return cell, there
+
+    def _key(self, cell, grid):
+        """A number below that of keys, from the cell of a grid (UInt32 [n])."""
+        x, y, z = cell
+        mixed = x * 0x9E3779B1 + y * 0x85EBCA6B + z * 0xC2B2AE35 + grid * 0x27D4EB2F
+        return ((mixed ^ (mixed >> 15)) * mi.UInt32(0x2C1B3C6D)) >> self._shift
 
 
 def _covered(corners, under, over, shape):
@@ -210,43 +327,6 @@ def _covered(corners, under, over, shape):
     covered = np.zeros(shape, dtype=bool)
     covered.reshape(-1)[sides] = taken.all(axis=1)
     return covered
-
-
-def _boxes_that_meet(low, high, faces, tolerance, likely):
-    """Yield ``likely`` pairs of ``faces`` whose boxes low…high [n, 3] meet, not only at an edge.
-
-    The first is of the size of the second at least.
-    """
-    low, high = low - low.min(axis=0) - tolerance, high - low.min(axis=0) + tolerance
-    level, faces = np.frexp((high - low).max(axis=1))[1], faces.astype(np.uint32)
-    for size in np.unique(level[faces]):
-        # Faces no larger than a cell are in eight cells at most.
-        small = faces[level[faces] <= size]
-        ends = np.floor(np.stack([low[small], high[small]]) / 2.0**size).astype(np.int64)
-        wide = ends[0] != ends[1]
-        keys, there = [], []
-        for corner in np.ndindex(2, 2, 2):
-            new = (wide | (np.array(corner) == 0)).all(axis=1)
-            x, y, z = (ends[corner[k], new, k] for k in range(3))
-            keys.append(
-                x * 0x9E3779B97F4A7C1 + y * 0x2545F4914F6CDD1D + z * 0x27D4EB2F165667C5
-            )  # two cells of one key only cost time
-            there.append(small[new])
-        keys, there = np.concatenate(keys), np.concatenate(there)
-        largest = np.flatnonzero(level[there] == size)
-        largest = largest[np.argsort(keys[largest])]
-        start, end = (np.searchsorted(keys[largest], keys, side) for side in ("left", "right"))
-        start[largest] = np.arange(len(largest)) + 1  # of two as large, one looks at the other
-        count, ordered = end - start, there[largest]
-        for part in np.split(np.arange(len(count)), np.flatnonzero(np.diff(np.cumsum(count) // CHUNK)) + 1):
-            each = count[part]
-            g = np.repeat(there[part], each)
-            f = ordered[np.repeat(start[part] - np.cumsum(each) + each, each) + np.arange(len(g))]
-            near = likely(f, g) & (f != g)  # first, as few pass
-            f, g = f[near], g[near]
-            shared = np.minimum(high[f], high[g]) - np.maximum(low[f], low[g]) - 2 * tolerance
-            near = (shared > -tolerance).all(axis=1) & ((shared > tolerance / 2).sum(axis=1) > 1)
-            yield f[near], g[near]
 
 
 def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:

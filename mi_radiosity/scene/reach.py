@@ -55,9 +55,18 @@ def _cast(rays, patch, number):
     seed = dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH))
     patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
     u, v, s, t = kronecker(number, patch, seed)
-    hit = rays.follow(*rays.leave(patch, *triangle(u, v), s, t), hash_pair(patch, number), seed)
-    dr.eval(hit.patch, hit.valid)
-    return np.array(hit.patch), ~np.array(hit.valid).astype(bool)
+    origin, direction = rays.leave(patch, *triangle(u, v), s, t)
+    hit = rays.trace(origin, direction)
+    end, valid = hit.patch, hit.valid
+    dr.eval(end, valid, origin, direction)
+    # What has no diffuse lobe sends them on; of the others their light gets some.
+    on = dr.compress(valid & (end == NONE)) if rays.lobes else mi.UInt32()
+    if dr.width(on):
+        start = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
+        last = rays.follow(*start, dr.gather(mi.UInt32, hash_pair(patch, number), on), seed)
+        dr.scatter(end, last.patch, on)
+        dr.scatter(valid, last.valid, on)
+    return np.array(end), ~np.array(valid).astype(bool)
 
 
 def _from_lamps(rays, lamps):

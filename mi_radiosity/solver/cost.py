@@ -14,10 +14,11 @@ from ..transport.emit import AT_ONCE
 ELEMENTS = 19_000  # default mesh: so many leaves more than patches
 RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
+FEW_RAYS = 30  # per element, below which it is noisy, and shares with others if the time is short
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
 SHARED = 6 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
-PROBES = 1 << 18  # rays that are timed
+PROBES = 1 << 16  # rays that are timed
 RUN = 32  # of them leave from one patch, as most rays of a solve have a neighbour there
 FOLLOWED = 0.5  # of the rays go on through lobes; the others are lines
 # Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
@@ -81,9 +82,11 @@ def afford(
     """
     usual = estimate_cost(model, elements, rays)
     share = min(max(seconds / max(usual.seconds, 1e-9), FEWEST), MOST)
+    rays = rays or round(share * usual.rays)
     if elements is None and share < 1:
         elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
-    return elements, rays or round(share * usual.rays)
+        elements = min(elements, max(rays // FEW_RAYS, ELEMENTS))
+    return elements, rays
 
 
 def _seconds(model, follow):

@@ -13,12 +13,10 @@ from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Transport
-from .cost import afford, default_rays, plan
+from .cost import FEW_RAYS, afford, default_rays, plan
 from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
-
-FEW_RAYS = 30  # per element, below which a user is warned
 
 
 @interruptible()
