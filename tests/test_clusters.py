@@ -1,9 +1,11 @@
 """Clusters of faces: what they are, that they keep all light, and that they look like the faces themselves."""
 
+from itertools import pairwise
+
 import mi_radiosity as mr
 from mi_radiosity.core.points import kronecker
 from mi_radiosity.evaluation import ladder
-from mi_radiosity.mesh import Clusters, Exposure, Tree
+from mi_radiosity.mesh import Clusters, Pairs, Tree, cluster_labels
 from mi_radiosity.scene import Model
 
 import drjit as dr
@@ -27,11 +29,25 @@ def model(room):
 
 
 @pytest.fixture(scope="module")
-def clusters(model):
+def labels(model):
+    return cluster_labels(model.faces, model.patches, np.zeros(model.patches.count, dtype=bool), 4_000)
+
+
+@pytest.fixture(scope="module")
+def tree(model, labels):
+    """Patches under clusters, some of which are split."""
+    tree = Tree(model.patches, model.materials, model.lights, labels)
+    first = model.patches.count
+    tree.split(mi.UInt32(np.arange(first, first + 200)))
+    tree.split(tree.part(mi.UInt32([first, first + 7]), mi.UInt32([0, 1])))
+    return tree
+
+
+@pytest.fixture(scope="module")
+def clusters(model, labels):
     """With their mesh."""
-    mesh = Tree(model.patches, model.materials, model.lights).freeze()
-    exposure = Exposure.of(mesh, model.rays, 0)
-    return Clusters.make(model.faces, mesh, exposure, 4_000), mesh
+    mesh = Tree(model.patches, model.materials, model.lights, labels).freeze()
+    return Clusters.of_leaves(mesh), mesh
 
 
 def test_clusters_are_parts_of_one_side_of_one_shape(model, clusters):
@@ -47,6 +63,91 @@ def test_clusters_are_parts_of_one_side_of_one_shape(model, clusters):
     for rows in np.split(member, start[1:-1]):
         assert len(set(model.faces.shape[face[rows]])) == len(set(back[rows])) == 1
         assert (normal[rows] @ normal[rows[0]] > 0.6).all()
+
+
+def test_clusters_lie_in_larger_ones(labels):
+    for larger, smaller in pairwise(labels):
+        assert len(np.unique(np.column_stack([larger, smaller]), axis=0)) == len(np.unique(smaller))
+        assert len(np.unique(larger)) < len(np.unique(smaller))
+
+
+def test_elements_above_the_patches(model, tree):
+    """Every patch is found below its root, part after part; leaves are counted; areas and ρ are those of all parts."""
+    patches, crown = model.patches.count, tree.crown
+    patch = dr.arange(mi.UInt32, patches)
+    assert (
+        tree.leaf_count
+        == len(np.unique(np.array(tree.top(patch))))
+        == len(np.unique(np.array(tree.freeze().top(patch))))
+    )
+    element, zero = tree.root_element(tree.root(patch)), dr.zeros(mi.Float, patches)
+    area, rho = (np.zeros((len(tree), 3)) for _ in range(2))
+    own, color = np.array(model.patches.area)[:, None], np.array(model.patches.reflectance).T
+    for _ in range(4):
+        above = np.flatnonzero(np.array(crown.holds(element)))
+        np.add.at(area, np.array(element)[above], own[above])
+        np.add.at(rho, np.array(element)[above], own[above] * color[above])
+        number = tree.part_at(element, patch, zero, zero)
+        assert (np.array(number) < np.array(tree.parts(element)))[above].all()
+        element = dr.select(crown.holds(element), tree.part(element, number), element)
+    np.testing.assert_array_equal(np.array(element), np.array(patch))
+    clusters = np.arange(patches, patches + len(crown))
+    np.testing.assert_allclose(np.array(tree.area)[clusters], area[clusters, 0], rtol=1e-5)
+    np.testing.assert_allclose(
+        np.array(tree.reflectance).T[clusters], (rho / np.maximum(area, 1e-30))[clusters], rtol=1e-5
+    )
+
+
+def test_points_of_clusters_are_uniform(model, tree):
+    """χ² over the patches of the largest cluster."""
+    cluster = int(np.array(tree.area)[model.patches.count :].argmax()) + model.patches.count
+    n = 100_000
+    x0, x1, _, _ = kronecker(dr.arange(mi.UInt32, n), mi.UInt32(1), mi.UInt32(2))
+    patch, u, v = tree.points(dr.full(mi.UInt32, cluster, n), x0, x1)
+    assert (np.array(u) >= 0).all() and (np.array(v) >= 0).all() and (np.array(u + v) <= 1).all()
+    found = np.bincount(np.array(patch), minlength=model.patches.count)
+    inside = found > 0
+    share = np.array(model.patches.area, dtype=np.float64)[inside]
+    assert share.sum() == pytest.approx(np.array(tree.area)[cluster], rel=1e-3)
+    assert stats.chisquare(found[inside], n * share / share.sum()).pvalue > 1e-3
+
+
+def test_pairs_of_clusters_see_what_their_patches_see(model, labels):
+    """Σ A_i F(i, lamp) by lines from clusters and from patches, to within 4 standard errors."""
+    patches, lines, power = model.patches, 64, []
+    lamp = int(np.argmax(np.array(patches.emission)[0]))
+    every = np.setdiff1d(np.arange(patches.count), [lamp])
+    for above in (labels, None):
+        tree = Tree(patches, model.materials, model.lights, above)
+        pairs = Pairs(tree, model.rays, mr.GMI(0.5), lines, 0)
+        pairs.add_roots(mi.UInt32(every), mi.UInt32(np.full(len(every), lamp)))
+        numbers = dr.arange(mi.UInt32, len(pairs) - 1) + 1
+        kernel = np.array(pairs.kernel_samples(numbers), dtype=np.float64).reshape(-1, lines)
+        area = np.array(tree.area)[np.array(pairs.receiver)[1:]]
+        power.append((area @ kernel.mean(axis=1), area**2 @ kernel.var(axis=1) / lines))
+    (one, error), (two, other) = power
+    assert one > 0 and abs(one - two) < 4 * (error + other) ** 0.5
+
+
+def test_split_pairs_lead_to_their_parts(model, tree):
+    """Whichever of two elements is split, a ray is found in the part that its patch is in."""
+    pairs = Pairs(tree, model.rays, mr.GMI(0.5), 10, 0)
+    member, start, end = (np.array(x) for x in (tree.crown.member, tree.crown.start, tree.crown.end))
+    i, j = (mi.UInt32(member[start[k] : end[k]][:3]) for k in (0, 7))
+    pairs.add_roots(i, j)
+    u = dr.full(mi.Float, 0.25, 3)
+    for _ in range(2):
+        pair = pairs.descend(pairs.find_roots(i, j), i, u, u, j, u, u)
+        pairs.split(mi.UInt32(np.unique(np.array(pair))), pairs.larger(mi.UInt32(np.unique(np.array(pair)))))
+    pair = pairs.descend(pairs.find_roots(i, j), i, u, u, j, u, u)
+    for patch, ends in ((i, pairs.receiver), (j, pairs.source)):
+        element, above = dr.gather(mi.UInt32, ends, pair), tree.root_element(tree.root(patch))
+        path = [np.array(above)]
+        for _ in range(3):
+            inside = tree.crown.holds(above)
+            above = dr.select(inside, tree.part(above, tree.part_at(above, patch, u, u)), above)
+            path.append(np.array(above))
+        assert (np.array(path) == np.array(element)).any(axis=0).all()
 
 
 def test_leaves_are_picked_by_area(clusters):

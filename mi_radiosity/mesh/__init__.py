@@ -1,8 +1,8 @@
 """Elements and pairs: what a scene is divided into, and who exchanges power with whom."""
 
-from .clusters import Clusters
+from .clusters import Clusters, cluster_labels
 from .elements import Elements, Tree
-from .exposure import Exposure
+from .exposure import Exposure, crossed_leaves
 from .pairs import Pairs
 
-__all__ = ["Clusters", "Elements", "Exposure", "Pairs", "Tree"]
+__all__ = ["Clusters", "Elements", "Exposure", "Pairs", "Tree", "cluster_labels", "crossed_leaves"]

@@ -6,13 +6,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, ColorSums, components, lower_bound_within, owned, row_keys, totals
+from ..core.arrays import ColorSums, components, lower_bound_within, owned, row_keys, totals
 from ..scene.faces import Faces
+from ..scene.patches import Patches
 from .elements import Elements
-from .exposure import Exposure
 
 BINS = 2.0  # per unit of a normal's coordinates: normals of a cluster are within some 25° of each other
 ROUNDS = 10  # of the search for a size
+LEVELS = 3  # of clusters above each other, each twice as large
 NEARLY = 0.85  # of the clusters wanted are enough of them
 
 
@@ -20,11 +21,10 @@ NEARLY = 0.85  # of the clusters wanted are enough of them
 class Clusters:
     """Leaves that share one irradiance, in the order of ``elements.leaves``. Immutable.
 
-    A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube (see `make`); leaves of
-    divided patches, and leaves that walls cross, stand alone. ``of`` (UInt32 [leaves]): the cluster of each
-    leaf; there are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster after cluster, beginning at
-    ``start`` (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with each, from the first of all
-    on, m². Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
+    Those of one cluster of a `Crown` that was not split do; leaves of divided patches stand alone. ``of`` (UInt32
+    [leaves]): the cluster of each leaf; there are ``count``. ``member`` (UInt32 [leaves]): rows of leaves, cluster
+    after cluster, beginning at ``start`` (UInt32 [count + 1]); ``until`` (Float64 [leaves]): their areas up to and with
+    each, from the first of all on, m². Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
     """
 
     count: int
@@ -34,36 +34,14 @@ class Clusters:
     until: "mi.Float64"
 
     @staticmethod
-    def make(faces: Faces, elements: Elements, exposure: Exposure, wanted: int) -> "Clusters":
-        """Clusters so large that there are no more than ``wanted``, or as few as there can be.
-
-        Where parts that are connected do not get so few, parts of one cube need not be, nor keep clear of walls.
-        """
-        leaves, p = elements.leaves, elements.patches
-        patch = np.array(dr.gather(mi.UInt32, elements.patch, leaves))
-        lone = np.array(elements.level(leaves)) > 0
-        crossed = np.array(dr.gather(mi.UInt32, exposure.slot, leaves)) != NONE
-        face, back = np.array(p.face)[patch], np.array(p.back).astype(np.int64)[patch]
-        centre = faces.corners[face].mean(axis=1) - faces.corners.min(axis=(0, 1))
-        bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS).astype(np.int64)
-        kind = row_keys(np.column_stack([faces.shape[face], back, bins]))
-        kind = np.where(lone, -1 - np.arange(len(face)), kind)  # like no other
-        a, b = _neighbours(faces, face, back, ~(lone | crossed))
-        a, b = (ends[kind[a] == kind[b]] for ends in (a, b))
-        size = np.sqrt(faces.area[face].sum() / max(wanted - lone.sum(), 1))
-
-        def connected(cell):
-            joined = (cell[a] == cell[b]).all(axis=1)
-            return components(len(face), a[joined], b[joined])
-
-        def near(cell):
-            return row_keys(np.column_stack([kind, np.where(lone[:, None], 0, cell)]))
-
-        for label_of in (connected, near):
-            label, count = _search(lambda size, of=label_of: of(np.floor(centre / size).astype(np.int64)), size, wanted)
-            if count <= wanted:
-                break
-        return Clusters._from_labels(label, np.array(dr.gather(mi.Float, elements.area, leaves), dtype=np.float64))
+    def of_leaves(elements: Elements) -> "Clusters":
+        """Those of elements with a `Crown`."""
+        patch = dr.gather(mi.UInt32, elements.patch, elements.leaves)
+        lone = elements.level(elements.leaves) > 0
+        label = np.array(dr.select(lone, elements.leaves, elements.top(patch)))
+        return Clusters._from_labels(
+            label, np.array(dr.gather(mi.Float, elements.area, elements.leaves), dtype=np.float64)
+        )
 
     @staticmethod
     def _from_labels(label: np.ndarray, area: np.ndarray) -> "Clusters":
@@ -104,14 +82,61 @@ class Clusters:
         return self.spread([s / whole for s in self.sums([v * area for v in values])])
 
 
-def _search(label_at, size, wanted):
-    """Labels at the size of cubes that has nearly ``wanted`` of them, or the fewest found; and how many."""
-    low, high, best, last = 0.0, None, (None, np.inf), np.inf
+def cluster_labels(
+    faces: Faces, patches: Patches, crossed: np.ndarray, wanted: int, levels: int = LEVELS
+) -> list[np.ndarray]:
+    """Clusters inside of larger ones, the largest first: labels of the patches (int [patches] each).
+
+    A cluster is a connected part of one side of one shape, flat to BINS, that fits into a cube; patches that walls
+    cross (bool [patches]) stand alone. The largest cubes are those for which there are no more than ``wanted``
+    clusters; where parts that are connected do not get so few, parts of one cube need not be, nor keep clear of walls.
+    The next have cubes half as large each, as long as they are less than the patches.
+    """
+    face, back = np.array(patches.face), np.array(patches.back).astype(np.int64)
+    corners = faces.corners[face]
+    centre = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3 - faces.corners.min(axis=(0, 1))
+    bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS).astype(np.int64)
+    kind = row_keys(np.column_stack([faces.shape[face], back, bins]))
+    a, b = _neighbours(faces, face, back, ~crossed)
+    a, b = (ends[kind[a] == kind[b]] for ends in (a, b))
+
+    def connected(size):
+        cell = row_keys(np.floor(centre / size).astype(np.int64))
+        joined = cell[a] == cell[b]
+        return components(len(face), a[joined], b[joined])
+
+    def near(size):
+        cell = np.floor(centre / size).astype(np.int64)
+        return first_of(row_keys(np.column_stack([kind, cell])))
+
+    size = np.sqrt(faces.area[face].sum() / max(wanted, 1))
+    for label_of in (connected, near):
+        label, count, size = _search(label_of, size, wanted)
+        if count <= wanted:
+            break
+    found = [label]
+    while len(found) < levels and count < len(face):
+        size /= 2
+        label = connected(size)
+        count = len(np.unique(label))
+        found.append(label)
+    return found
+
+
+def first_of(keys: np.ndarray) -> np.ndarray:
+    """For each key the place of the first that is the same (int [n])."""
+    _, first, of = np.unique(keys, return_index=True, return_inverse=True)
+    return first[of]
+
+
+def _search(label_of, size, wanted):
+    """Labels at the size of cubes that has nearly ``wanted`` of them, or the fewest found; how many, and the size."""
+    low, high, best, last = 0.0, None, (None, np.inf, size), np.inf
     for _ in range(ROUNDS):
-        label = label_at(size)
+        label = label_of(size)
         count = len(np.unique(label))
         if count <= wanted or (high is None and count < best[1]):
-            best = label, count
+            best = label, count, size
         if NEARLY * wanted < count <= wanted or (high is None and wanted < 0.98 * last < count):
             break
         last = count

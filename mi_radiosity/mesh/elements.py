@@ -4,12 +4,14 @@ from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..core.arrays import concat, opaque_index
-from ..core.points import hash_pair
+from ..core.arrays import concat, opaque_index, owned, owned_vectors, totals
+from ..core.points import hash_pair, triangle
 from ..scene.lights import Lights
 from ..scene.materials import Materials
 from ..scene.patches import Patches
+from .crown import Crown
 from .subdivision import child_at, child_frame
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
@@ -17,7 +19,8 @@ ARRAYS = ("patch", "parent", "child", "place", "u0", "v0", "scale", "area", "ref
 
 
 class Elements:
-    """A forest of triangular elements, one root per patch; element k < patches is the root of patch k.
+    """A forest of triangular elements, one root per patch; element k < patches is the root of patch k. The next are the
+    clusters of a `Crown`, if there is one: elements above patches, which no leaf of the mesh is.
 
     An element covers the points (u, v) = (u₀ + s a, v₀ + s b), a, b ≥ 0, a + b ≤ 1, of its patch;
     s = ±2^(−level), negative for the middle child of four, which stands upside down.
@@ -40,11 +43,16 @@ class Elements:
     area: "mi.Float"
     reflectance: "mi.Color3f"
     exitance: "mi.Color3f | None"
+    crown: Crown | None
 
     def __init__(
-        self, patches: Patches, arrays: "dict[str, dr.ArrayBase]", exitance: "mi.Color3f | None" = None
+        self,
+        patches: Patches,
+        arrays: "dict[str, dr.ArrayBase]",
+        exitance: "mi.Color3f | None" = None,
+        crown: Crown | None = None,
     ) -> None:
-        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance)
+        vars(self).update({name: arrays[name] for name in ARRAYS}, patches=patches, exitance=exitance, crown=crown)
 
     def __len__(self) -> int:
         return dr.width(self.patch)
@@ -55,13 +63,16 @@ class Elements:
     @cached_property
     def leaves(self) -> "mi.UInt32":
         """Numbers of the leaves (UInt32 [leaves]), neighbours after neighbours, whichever was split first."""
-        leaves = dr.compress(self.child == 0)
+        is_leaf = self.child == 0
+        if self.crown:
+            is_leaf &= ~self.crown.holds(dr.arange(mi.UInt32, len(self)))
+        leaves = dr.compress(is_leaf)
         patch, place = dr.gather(mi.UInt32, self.patch, leaves), dr.gather(mi.UInt32, self.place, leaves)
         return dr.gather(mi.UInt32, leaves, dr.argsort((mi.UInt64(patch) << 32) | mi.UInt64(place)))
 
     def with_light(self, patches: Patches, exitance: "mi.Color3f | None") -> "Elements":
         """The same elements of patches that differ in their emission only."""
-        other = Elements(patches, {name: getattr(self, name) for name in ARRAYS}, exitance)
+        other = Elements(patches, {name: getattr(self, name) for name in ARRAYS}, exitance, self.crown)
         vars(other)["leaves"] = self.leaves  # sorted once for all
         return other
 
@@ -96,6 +107,65 @@ class Elements:
         """Child number 0…3 of ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         return child_at(*self.own_point(element, u, v))
 
+    # ---- Elements of patches and clusters ------------------------------------------------------
+
+    def root(self, patch: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.UInt32":
+        """The number of the element that nothing is above, among all such (UInt32 [n])."""
+        return patch if self.crown is None else dr.gather(mi.UInt32, self.crown.root_of, patch, active)
+
+    def root_element(self, number: "mi.UInt32") -> "mi.UInt32":
+        """The elements of these numbers (UInt32 [n])."""
+        return number if self.crown is None else dr.gather(mi.UInt32, self.crown.roots, number)
+
+    @property
+    def roots(self) -> int:
+        """How many elements nothing is above."""
+        return self.patches.count if self.crown is None else dr.width(self.crown.roots)
+
+    def points(self, element: "mi.UInt32", x0: "mi.Float", x1: "mi.Float") -> "tuple[mi.UInt32, mi.Float, mi.Float]":
+        """Uniform points of elements from uniform numbers: patch, u, v (UInt32, two Float [n])."""
+        patch = dr.gather(mi.UInt32, self.patch, element)
+        if self.crown:
+            above = self.crown.holds(element)
+            member, rest = self.crown.pick(element, x0, above)
+            patch, x0 = dr.select(above, member, patch), dr.select(above, rest, x0)
+        return patch, *self.patch_point(element, *triangle(x0, x1))
+
+    def part_at(self, element: "mi.UInt32", patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.UInt32":
+        """Which child of elements holds points of patches (UInt32 [n])."""
+        if self.crown is None:
+            return self.locate(element, u, v)
+        above = self.crown.holds(element)
+        return dr.select(above, self.crown.locate(element, patch, above), self.locate(element, u, v))
+
+    def part(self, element: "mi.UInt32", number: "mi.UInt32") -> "mi.UInt32":
+        """The child of split elements that has a number (UInt32 [n])."""
+        child = dr.gather(mi.UInt32, self.child, element) + number
+        if self.crown is None:
+            return child
+        above = self.crown.holds(element)
+        return dr.select(above, self.crown.child(element, number, above), child)
+
+    def parts(self, element: "mi.UInt32") -> "mi.UInt32":
+        """How many children elements have once they are split (UInt32 [n])."""
+        if self.crown is None:
+            return dr.full(mi.UInt32, 4, dr.width(element))
+        above = self.crown.holds(element)
+        return dr.select(above, self.crown.children(element, above), 4)
+
+    def top(self, patch: "mi.UInt32") -> "mi.UInt32":
+        """The cluster that was not split above patches, or themselves where there is none (UInt32 [n])."""
+        return patch if self.crown is None else self._top(self.crown, patch)
+
+    @dr.syntax
+    def _top(self, crown, patch):
+        element = self.root_element(self.root(patch))
+        above = crown.holds(element) & (dr.gather(mi.UInt32, self.child, element) != 0)
+        while above:
+            element = crown.child(element, crown.locate(element, patch, above), above)
+            above = crown.holds(element) & (dr.gather(mi.UInt32, self.child, element) != 0)
+        return element
+
     @dr.syntax
     def leaf_at(
         self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
@@ -110,11 +180,14 @@ class Elements:
 
 
 class Tree(Elements):
-    """Elements that still split. ``leaf_count`` is the number of leaves."""
+    """Elements that still split. ``leaf_count`` is the number of those that have not; of patches below a cluster that
+    has not, the cluster counts."""
 
     __setattr__ = object.__setattr__  # type: ignore[assignment]
 
-    def __init__(self, patches: Patches, materials: Materials, lights: Lights) -> None:
+    def __init__(
+        self, patches: Patches, materials: Materials, lights: Lights, labels: "list[np.ndarray] | None" = None
+    ) -> None:
         n = patches.count
         every = dr.arange(mi.UInt32, n)
         zero, nought = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n)
@@ -123,6 +196,27 @@ class Tree(Elements):
         self._materials, self._lights, self.leaf_count = materials, lights, n
         if lights.textured:
             self.exitance = mi.Color3f(patches.emission)
+        if labels:
+            self._crown(Crown(patches, labels))
+
+    def _crown(self, crown):
+        """Put clusters above the patches."""
+        n, m = self.patches.count, len(crown)
+        first = dr.gather(mi.UInt32, crown.member, crown.start)
+        new = {name: dr.zeros(type(getattr(self, name)), m) for name in ARRAYS} | {
+            "patch": first,
+            "parent": opaque_index(n) + dr.arange(mi.UInt32, m),
+            "place": (1 + crown.depth) << 4,  # no other element of the patch has it
+            "scale": dr.full(mi.Float, 1, m),
+            "area": owned(mi.Float, crown.area),
+            "reflectance": owned_vectors(mi.Color3f, crown.means(np.array(self.reflectance).T)),
+        }
+        for name in ARRAYS:
+            setattr(self, name, concat(getattr(self, name), new[name]))
+        if self.exitance is not None:
+            self.exitance = concat(self.exitance, dr.gather(mi.Color3f, self.exitance, first))
+        self.crown, self.leaf_count = crown, dr.width(crown.roots)
+        dr.eval(*self._arrays().values())
 
     @property
     def leaves(self) -> "mi.UInt32":
@@ -131,13 +225,16 @@ class Tree(Elements):
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
         arrays = {name: type(value)(value) for name, value in self._arrays().items()}
-        return Elements(self.patches, arrays, None if self.exitance is None else mi.Color3f(self.exitance))
+        exitance = None if self.exitance is None else mi.Color3f(self.exitance)
+        return Elements(self.patches, arrays, exitance, self.crown)
 
     def _arrays(self):
         return {name: getattr(self, name) for name in ARRAYS}
 
     def split(self, chosen: "mi.UInt32") -> None:
         """Split the leaves ``chosen`` (UInt32 [n], no number twice)."""
+        if self.crown:
+            chosen = self._split_clusters(chosen)
         count = dr.width(chosen)
         if count == 0:
             return
@@ -152,6 +249,15 @@ class Tree(Elements):
             self.exitance = concat(self.exitance, mean_exitance(self.patches, self._lights, *frame))
         self.leaf_count += 3 * count
         dr.eval(*self._arrays().values())
+
+    def _split_clusters(self, chosen):
+        """Split those of elements that are clusters; returns the others."""
+        above = self.crown.holds(chosen)
+        clusters = dr.gather(mi.UInt32, chosen, dr.compress(above))
+        if dr.width(clusters):
+            dr.scatter(self.child, mi.UInt32(1), clusters)
+            self.leaf_count += int(totals([self.parts(clusters)])[0]) - dr.width(clusters)
+        return dr.gather(mi.UInt32, chosen, dr.compress(~above))
 
     def _children(self, parent, which):
         """Arrays of the children ``which`` of elements."""

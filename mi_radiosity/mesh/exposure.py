@@ -44,7 +44,7 @@ class Exposure:
     @staticmethod
     def of(elements: Elements, rays: Rays, seed: int) -> "Exposure":
         """Look at every leaf."""
-        crossed = _crossed_leaves(elements, rays)
+        crossed = crossed_leaves(elements, rays)
         slot = dr.full(mi.UInt32, NONE, len(elements))
         if dr.width(crossed):
             dr.scatter(slot, dr.arange(mi.UInt32, dr.width(crossed)), crossed)
@@ -67,6 +67,7 @@ def _open_area(elements, rays, seed):
     area = mi.Float64(dr.gather(mi.Float, elements.area * share, elements.leaves))
     sums = sum_up(elements, [area, mi.Float64(0), mi.Float64(0)], [2 * elements.patches.total_area, 1, 1])
     result = mi.Float(sums.gather(dr.arange(mi.UInt32, len(elements)))[0])
+    result = dr.select(result > 0, result, elements.area)  # clusters are no ancestors
     dr.eval(result)
     return result
 
@@ -107,7 +108,7 @@ def is_covered(
     return inside(other, inside(aside, inside(normal, ~lamp))) | ~rays.on_top(patch, u, v)
 
 
-def _crossed_leaves(elements, rays):
+def crossed_leaves(elements: Elements, rays: Rays) -> "mi.UInt32":
     """Leaves that a wall stands across: what crosses a triangle crosses its sides (UInt32 [n])."""
     leaves = elements.leaves
     corners = [node_point(elements, leaves, node) for node in range(3)]

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, concat, lower_bound, lower_bound_within, opaque_index, unique
-from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
+from ..core.points import Stream, hash_pair, kronecker, stream_seed
 from ..oracles import KernelSamples, Oracle, Pair
 from ..scene.rays import Rays
 from .elements import MAX_LEVEL, Elements
@@ -71,6 +71,7 @@ class Pairs:
 
     def find_roots(self, i: "mi.UInt32", j: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.UInt32":
         """Numbers of the root pairs of patches (i, j), NONE where there is none yet (UInt32 [n])."""
+        i, j = self.elements.root(i, active), self.elements.root(j, active)
         first, last = dr.gather(mi.UInt32, self._row, i, active), dr.gather(mi.UInt32, self._row, i + 1, active)
         at = lower_bound_within(self._sources, j, first, last, active)
         found = active & (at < last) & (dr.gather(mi.UInt32, self._sources, at, active) == j)
@@ -80,9 +81,10 @@ class Pairs:
         """Make root pairs of patches (i, j) that have none (UInt32 [n], repetitions allowed)."""
         if dr.width(i) == 0:
             return
+        i, j = self.elements.root(i), self.elements.root(j)
         keys = unique((mi.UInt64(i) << 32) | mi.UInt64(j))
         fresh = opaque_index(len(self)) + dr.arange(mi.UInt32, dr.width(keys))
-        self._append(mi.UInt32(keys >> 32), mi.UInt32(keys))
+        self._append(*(self.elements.root_element(mi.UInt32(k)) for k in (keys >> 32, keys)))
         keys, roots = concat(self._root_keys, keys), concat(self._roots, fresh)
         order = dr.argsort(keys)
         self._root_keys, self._roots = dr.gather(mi.UInt64, keys, order), dr.gather(mi.UInt32, roots, order)
@@ -90,9 +92,9 @@ class Pairs:
         self._index_rows()
 
     def _index_rows(self):
-        """Note where the keys of each receiving patch begin, which makes searches short."""
+        """Note where the keys of each receiving root begin, which makes searches short."""
         self._sources = mi.UInt32(self._root_keys)
-        rows = dr.arange(mi.UInt32, self.elements.patches.count + 1)
+        rows = dr.arange(mi.UInt32, self.elements.roots + 1)
         self._row = lower_bound(self._root_keys, mi.UInt64(rows) << 32)
         dr.eval(self._sources, self._row)
 
@@ -100,20 +102,23 @@ class Pairs:
     def descend(
         self,
         pair: "mi.UInt32",
+        i: "mi.UInt32",
         ui: "mi.Float",
         vi: "mi.Float",
+        j: "mi.UInt32",
         uj: "mi.Float",
         vj: "mi.Float",
         active: "mi.Bool | bool" = True,
     ) -> "mi.UInt32":
-        """Follow points (ui, vi) of receivers and (uj, vj) of sources down to pairs without children."""
+        """Follow points (ui, vi) of receiving patches i and (uj, vj) of sources j down to pairs without children."""
         pair = mi.UInt32(pair)
         child = dr.gather(mi.UInt32, self.child, pair, active)
         while child != 0:
             split = dr.gather(mi.UInt32, self.halved, pair)
             of_receiver = (split & 1) == 1
+            patch = dr.select(of_receiver, i, j)
             u, v = dr.select(of_receiver, ui, uj), dr.select(of_receiver, vi, vj)
-            pair = child + self.elements.locate(split >> 1, u, v)
+            pair = child + self.elements.part_at(split >> 1, patch, u, v)
             child = dr.gather(mi.UInt32, self.child, pair)
         return pair
 
@@ -151,8 +156,7 @@ class Pairs:
         i, j = dr.gather(mi.UInt32, self.receiver, pairs), dr.gather(mi.UInt32, self.source, pairs)
         x0, x1, y0, y1 = kronecker(k % lines, hash_pair(e.key(i), e.key(j)), self._seed, of)
         i, j = dr.gather(mi.UInt32, i, of), dr.gather(mi.UInt32, j, of)
-        x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
-        return self.rays.kernel(dr.gather(mi.UInt32, e.patch, i), *x, dr.gather(mi.UInt32, e.patch, j), *y)
+        return self.rays.kernel(*e.points(i, x0, x1), *e.points(j, y0, y1))
 
     def describe(self, pairs: "mi.UInt32", radiosity: "mi.Color3f | None" = None) -> Pair:
         """Pairs as the oracle sees them; with ``radiosity`` B (Color3f [elements]) as its rule of acceptance does."""
@@ -182,16 +186,21 @@ class Pairs:
         return dr.select(free_i & (larger_i | ~free_j), i, dr.select(free_j, j, NONE))
 
     def split(self, chosen: "mi.UInt32", element: "mi.UInt32") -> None:
-        """Give the pairs ``chosen`` (UInt32 [n]) the four children of their ``element`` (UInt32 [n])."""
+        """Give the pairs ``chosen`` (UInt32 [n]) the children of their ``element`` (UInt32 [n])."""
         count = dr.width(chosen)
         if count == 0:
             return
         of_receiver = element == dr.gather(mi.UInt32, self.receiver, chosen)
-        dr.scatter(self.child, opaque_index(len(self)) + 4 * dr.arange(mi.UInt32, count), chosen)
+        parts = self.elements.parts(element)
+        end = dr.cumsum(parts)
+        start = end - parts
+        dr.scatter(self.child, opaque_index(len(self)) + start, chosen)
         dr.scatter(self.halved, 2 * element + dr.select(of_receiver, mi.UInt32(1), 0), chosen)
-        k = dr.arange(mi.UInt32, 4 * count)
-        parent, split = dr.gather(mi.UInt32, chosen, k // 4), dr.gather(mi.UInt32, element, k // 4)
-        half = dr.gather(mi.UInt32, self.elements.child, split) + k % 4
+        above = self.elements.crown is not None
+        k = dr.arange(mi.UInt32, end[count - 1] if above else 4 * count)
+        row = lower_bound(end, k + 1) if above else k // 4
+        parent, split = dr.gather(mi.UInt32, chosen, row), dr.gather(mi.UInt32, element, row)
+        half = self.elements.part(split, k - dr.gather(mi.UInt32, start, row))
         receiver, source = dr.gather(mi.UInt32, self.receiver, parent), dr.gather(mi.UInt32, self.source, parent)
         of_receiver = receiver == split
         self._append(dr.select(of_receiver, half, receiver), dr.select(of_receiver, source, half))

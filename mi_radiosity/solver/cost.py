@@ -14,6 +14,7 @@ from ..transport.emit import AT_ONCE
 ELEMENTS = 19_000  # default mesh: so many leaves more than patches
 RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
 SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
+TOP = 1 / 4  # of the elements, at least, are there before the oracle is asked, where patches share them
 FEW_RAYS = 30  # per element, below which it is noisy, and shares with others if the time is short
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
 FEWEST = 1 / 32  # of the default elements and rays
@@ -45,7 +46,7 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     leaves, shared = plan(model, elements, None)
     count = leaves or model.patches.count
     rays = rays or default_rays(shared or count)
-    more, cast = count - model.patches.count, model.rays
+    more, cast = count - (top_of(shared) if shared else model.patches.count), model.rays
     line = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
     lobes = 0 if cast.lobes is None else max(_seconds(model, cast.follow) - line, 0)
     memory = (
@@ -60,17 +61,22 @@ def default_rays(elements: int) -> int:
 
 
 def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int | None, int | None]:
-    """Leaves to refine to, None where ε decides; and how many irradiances they may have, None if each has its own.
+    """Elements to refine to, None where ε decides; the same again if patches share them, else None.
 
-    Faces that are smaller than the light needs share it: where fewer elements are asked for than there are faces, or
-    where there are very many by default. Then some go to faces that are larger than the light needs, too.
+    Faces that are smaller than the light needs share: where fewer elements are asked for than there are faces, or where
+    there are very many by default.
     """
     count = model.patches.count
     if epsilon is not None:
         return None, None
-    if elements is None:
-        return count + ELEMENTS, SHARED if count + ELEMENTS > SHARED else None
-    return (elements, None) if elements >= count else (count + elements // 4, elements)
+    wanted = min(count + ELEMENTS, SHARED) if elements is None else elements
+    shares = count + ELEMENTS > SHARED if elements is None else elements < count
+    return wanted, wanted if shares else None
+
+
+def top_of(elements: int) -> int:
+    """How many of the elements are clusters to begin with where patches share; the oracle splits them from there on."""
+    return max(round(TOP * elements), elements - ELEMENTS, 1)
 
 
 def afford(

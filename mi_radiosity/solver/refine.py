@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..core.arrays import NONE, concat
+from ..core.arrays import NONE, concat, opaque_index, owned_vectors
 from ..core.errors import RadiosityError
 from ..core.points import Stream, stream_seed
-from ..mesh import Exposure, Pairs, Tree
+from ..mesh import Clusters, Exposure, Pairs, Tree
 from ..scene import Model
 from ..transport import Problem, Transport
 from ..transport.problem import Record
@@ -85,7 +86,9 @@ class Refinement:
         self._piloted = self._tree.leaf_count
         rays = min(max(PILOT_RAYS * self._tree.leaf_count, LEAST_PILOT), MOST_PILOT)
         elements = self._tree.freeze()
-        problem = Problem(self._model, elements, self._pairs.freeze(elements), Exposure.unseen(elements))
+        clusters = Clusters.of_leaves(elements) if elements.crown else None
+        exposure = Exposure.unseen(elements)
+        problem = Problem(self._model, elements, self._pairs.freeze(elements), exposure, clusters=clusters)
         # Each pilot draws from a stream of its own, and none from the final one's.
         flow = self._pilot(problem, rays, stream_seed(self._seed, Stream.PILOT, self._pilots), self.first_share)
         self._pilots += 1
@@ -93,6 +96,10 @@ class Refinement:
         self.first_share = flow.first_share
         every = dr.arange(mi.UInt32, len(elements))
         self._radiosity = elements.emission(every) + elements.reflectance * (flow.direct + flow.indirect)
+        if crown := elements.crown:
+            patches = np.array(self._radiosity).T[: elements.patches.count].astype(np.float64)
+            above = dr.arange(mi.UInt32, len(crown)) + opaque_index(elements.patches.count)
+            dr.scatter(self._radiosity, owned_vectors(mi.Color3f, crown.means(patches)), above)
         dr.eval(self._radiosity)
         self._hits = _with_roots(_joined(flow.records), self._pairs)
 
@@ -101,7 +108,7 @@ class Refinement:
         hits, pairs = self._hits, self._pairs
         if dr.width(hits.i) == 0:
             return 0
-        pair = pairs.descend(hits.pair, hits.ui, hits.vi, hits.uj, hits.vj)
+        pair = pairs.descend(hits.pair, hits.i, hits.ui, hits.vi, hits.j, hits.uj, hits.vj)
         dr.eval(pair)
         self._hits = replace(hits, pair=pair)
         visited = dr.zeros(mi.Bool, len(pairs))
@@ -149,6 +156,12 @@ class Refinement:
             return 0
         worst = dr.gather(mi.Float, worst, leaves)
         chosen = dr.gather(mi.UInt32, dr.argsort(worst, descending=True), dr.arange(mi.UInt32, count))
+        if tree.crown:  # whose parts are not four
+            more = dr.cumsum(tree.parts(dr.gather(mi.UInt32, leaves, chosen)) - 1)
+            chosen = dr.gather(mi.UInt32, chosen, dr.compress(more <= opaque_index(3 * room)))
+            count = dr.width(chosen)
+            if count == 0:
+                return 0
         if count < dr.width(leaves):
             self.epsilon = dr.gather(mi.Float, worst, chosen)[count - 1]
         before = len(tree)
@@ -166,6 +179,8 @@ class Refinement:
 
     def _inherit(self, before):
         """New elements start with the radiosity of their parents."""
+        if len(self._tree) == before:
+            return
         new = dr.arange(mi.UInt32, len(self._tree) - before) + dr.opaque(mi.UInt32, before)
         parent = dr.gather(mi.UInt32, self._tree.parent, new)
         self._radiosity = concat(self._radiosity, dr.gather(mi.Color3f, self._radiosity, parent))

@@ -5,15 +5,16 @@ from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.errors import RadiosityError, interruptible
 from ..core.points import Stream, stream_seed
-from ..mesh import Clusters, Exposure, Pairs, Tree
+from ..mesh import Clusters, Exposure, Pairs, Tree, cluster_labels, crossed_leaves
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Transport
-from .cost import FEW_RAYS, afford, default_rays, plan
+from .cost import FEW_RAYS, afford, default_rays, plan, top_of
 from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
@@ -65,7 +66,7 @@ def solve(
         elements, rays = afford(model, seconds - clock.total(), elements, rays)
     wanted, shared = plan(model, elements, epsilon)
 
-    tree = Tree(model.patches, model.materials, model.lights)
+    tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared, given))
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
         model,
@@ -81,9 +82,9 @@ def solve(
     refinement.run()
     mesh = tree.freeze()
     exposure = Exposure.of(mesh, model.rays, seed)
-    clusters = _clusters(model, mesh, exposure, shared, given)
+    clusters = Clusters.of_leaves(mesh) if mesh.crown else None
     problem = Problem(model, mesh, pairs.freeze(mesh), exposure, clusters=clusters)
-    count = clusters.count if clusters else tree.leaf_count
+    count = tree.leaf_count
     clock.lap("refine")
 
     rays = int(rays or default_rays(count))
@@ -108,7 +109,7 @@ def solve(
 
     stats = {
         "elements": count,
-        "leaves": tree.leaf_count,
+        "leaves": dr.width(mesh.leaves),
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
         "rays": sum(flow.rays for flow in flows),
@@ -129,17 +130,22 @@ def solve(
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
 
-def _clusters(model, mesh, exposure, shared, given):
-    """Clusters of the leaves if they are to have no more than ``shared`` irradiances, which must do if it was given."""
-    if shared is None or dr.width(mesh.leaves) <= shared:
+def _clusters(model, shared, given):
+    """Labels of clusters that leave room for what the oracle splits of ``shared`` elements, if the patches are to have
+    no more than so many; which must do if it was given."""
+    if shared is None:
         return None
-    clusters = Clusters.make(model.faces, mesh, exposure, shared)
-    if given and clusters.count > shared:
+    patches = Tree(model.patches, model.materials, model.lights).freeze()
+    crossed = np.zeros(model.patches.count, dtype=bool)
+    crossed[np.array(crossed_leaves(patches, model.rays))] = True
+    labels = cluster_labels(model.faces, model.patches, crossed, top_of(shared))
+    count = len(np.unique(labels[0]))
+    if given and count > shared:
         raise RadiosityError(
             f"{shared} elements cannot be reached: of {model.patches.count} patches only neighbours of one shape and "
-            f"of like normals share their light, so ask for {3 * clusters.count // 2} or more"
+            f"of like normals share their light, so ask for {3 * count // 2} or more"
         )
-    return clusters
+    return labels
 
 
 def _check(oracle, elements, epsilon, rays, lines, seconds):

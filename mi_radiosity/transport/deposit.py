@@ -18,7 +18,7 @@ def pair_of(problem: Problem, batch: Batch, hit: Hit | Trail) -> "mi.UInt32":
     """
     on_patch = straight(batch, hit)
     pair = problem.pairs.find_roots(hit.patch, batch.patch, on_patch)
-    return problem.pairs.descend(pair, hit.u, hit.v, batch.u, batch.v, pair != NONE)
+    return problem.pairs.descend(pair, hit.patch, hit.u, hit.v, batch.patch, batch.u, batch.v, pair != NONE)
 
 
 def straight(batch: Batch, hit: Hit | Trail) -> "mi.Bool":
@@ -28,9 +28,13 @@ def straight(batch: Batch, hit: Hit | Trail) -> "mi.Bool":
 
 
 def spread(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
-    """Over the receiver of the pair, or all of the patch: smooth, for pilots (UInt32 [rays])."""
-    known = pair != NONE
-    return dr.select(known, dr.gather(mi.UInt32, problem.pairs.receiver, pair, known), hit.patch)
+    """Over the receiver of the pair, or all of the patch, which shares with its cluster: smooth, for pilots
+    (UInt32 [rays])."""
+    known, crown = pair != NONE, problem.elements.crown
+    receiver = dr.gather(mi.UInt32, problem.pairs.receiver, pair, known)
+    if crown:
+        known &= ~crown.holds(receiver)
+    return dr.select(known, receiver, hit.patch)
 
 
 def trusted(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
