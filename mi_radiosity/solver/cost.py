@@ -45,7 +45,7 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     """
     leaves, shared = plan(model, elements, None)
     count = leaves or model.patches.count
-    rays = rays or default_rays(shared or count)
+    rays = rays or default_rays(model, shared or count)
     more, cast = count - (top_of(shared) if shared else model.patches.count), model.rays
     line = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
     lobes = 0 if cast.lobes is None else max(_seconds(model, cast.follow) - line, 0)
@@ -55,9 +55,11 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     return Cost(shared or count, rays, memory, line * (WORK * rays + LINES * more) + lobes * FOLLOWED * rays)
 
 
-def default_rays(elements: int) -> int:
-    """The ray budget of so many leaf elements where none is given."""
-    return RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
+def default_rays(model: Model, elements: int) -> int:
+    """The ray budget of so many leaf elements where none is given; twice as much where lamps cast sharp shadows, for
+    which rays look from where they end."""
+    rays = RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
+    return rays * (2 if any(light.may_be_sharp for light in model.lights.free) else 1)
 
 
 def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int | None, int | None]:

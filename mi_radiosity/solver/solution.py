@@ -170,7 +170,7 @@ class Solution:
         light = self.irradiance() if self.sharp is None else self.irradiance() - self.sharp
         reflected = self.elements.reflectance * light
         looks = self.sharp is not None
-        return Gatherer(self.model, self.elements, self.exposure, self.landings, reflected, looks)
+        return Gatherer(self.model, self.elements, self.exposure, self.landings, reflected, looks, self.sharp)
 
     def leaves(self) -> Leaves:
         """Geometry and light of all leaves, neighbours after neighbours."""

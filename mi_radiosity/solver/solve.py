@@ -87,7 +87,7 @@ def solve(
     count = tree.leaf_count
     clock.lap("refine")
 
-    rays = int(rays or default_rays(count))
+    rays = int(rays or default_rays(model, count))
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays: a Flow."""

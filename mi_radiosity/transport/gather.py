@@ -15,6 +15,7 @@ from .lamps import LampChoice
 from .landings import Landings
 
 LOOKS = 32  # points of a crossed leaf
+AFAR = 4.0  # sizes of an element, from which it is looked at as a whole
 
 
 @dataclass
@@ -53,7 +54,9 @@ class Gatherer:
     reflected: ρ H of the elements (Color3f [elements], W/m²); exposure, landings: on which side of a wall that crosses
     a leaf that light is. looks: sharp light of lamps that are no surfaces is not in it, so rays look for it from where
     they end: no oracle refines its shadows, and sun that comes in through a window is not to spread over whole
-    leaves. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
+    leaves. Where ``sharp``, the part of it that elements receive (Color3f [elements], W/m²), is known, only those look
+    that are nearer to where they end than a random share of its element's size, AFAR times that: from afar nobody sees
+    how light is spread over an element. Each sample is one line to the lamps, or one cosine-distributed ray, and its value
     an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
     so that no estimate exceeds their exitance however near they are.
     """
@@ -66,9 +69,14 @@ class Gatherer:
         landings: Landings,
         reflected: "mi.Color3f",
         looks: bool = False,
+        sharp: "mi.Color3f | None" = None,
     ) -> None:
         self._model, self._elements, self._reflected = model, elements, reflected
         self._exposure, self._looks = exposure, looks
+        self._sharp = None if sharp is None else elements.reflectance * sharp
+        if sharp is not None:
+            self._reach = _reach(elements)
+            dr.eval(self._sharp, self._reach)
         self._place(landings)
         self._lamps = LampChoice(model, elements)
         self._free = model.lights.free
@@ -199,7 +207,7 @@ class Gatherer:
         met = active & (hit.patch != NONE)
         leaf = dr.select(met, self._elements.leaf_at(hit.patch, hit.u, hit.v, met), NONE)
         end = leaf, hit.patch, hit.u, hit.v
-        lit = self._by_sharp_light(hit, leaf, number, seed)
+        lit = self._by_sharp_light(places, hit, leaf, number, seed)
         emission = model.lights.at(patches, hit.patch, hit.u, hit.v, met)
         if model.rays.lobes is None:
             sky = self._sky(places, direction, active & ~hit.valid, rays_per_line)
@@ -222,7 +230,7 @@ class Gatherer:
             return mi.Bool(False)
         return sky.is_sharp(direction)
 
-    def _by_sharp_light(self, hit, leaf, number, seed):
+    def _by_sharp_light(self, places, hit, leaf, number, seed):
         """ρ H of sharp light where rays end on leaves, if they are to look for it (Color3f [n])."""
         H, met, patches = mi.Color3f(0), leaf != NONE, self._model.patches
         if not self._looks:
@@ -230,10 +238,16 @@ class Gatherer:
         patch = dr.select(met, hit.patch, 0)
         x, normal = patches.point(patch, hit.u, hit.v), dr.gather(mi.Vector3f, patches.normal, patch)
         s, t = (uniform(number, seed ^ salt) for salt in (0x51AB1E, 0x0DDB411))
+        looks, known = met, mi.Color3f(0)
+        if self._sharp is not None:
+            reach = dr.gather(mi.Float, self._reach, leaf, met) * uniform(number, seed ^ 0xAFA4)
+            crossed = dr.gather(mi.UInt32, self._exposure.slot, leaf, met) != NONE
+            looks = met & (crossed | (dr.squared_norm(x - places.x) < dr.square(reach)))
+            known = dr.gather(mi.Color3f, self._sharp, leaf, met & ~looks)
         for light in self._free:
             if light.may_be_sharp:
-                H += light.lights_up(self._model.rays, x, normal, s, t, met, only_sharp=True)[1]
-        return H * dr.gather(mi.Color3f, self._elements.reflectance, leaf, met)
+                H += light.lights_up(self._model.rays, x, normal, s, t, looks, only_sharp=True)[1]
+        return dr.select(looks, H * dr.gather(mi.Color3f, self._elements.reflectance, leaf, looks), known)
 
     def _sky(self, places, direction, escaped, rays_per_line):
         """H from the sky that rays meet which go straight there, as far as lines do not find it (Color3f [n])."""
@@ -281,3 +295,13 @@ class Gatherer:
         if not materials.traced.any():
             return mi.Bool(True)
         return ~materials.is_traced(dr.gather(mi.UInt32, self._model.patches.face, patch))
+
+
+def _reach(elements):
+    """How far from elements rays may look at their spread of light (Float [elements], m); leaves that share light are
+    as large as their cluster."""
+    area = mi.Float(elements.area)
+    if elements.crown:
+        patch = dr.arange(mi.UInt32, elements.patches.count)
+        dr.scatter(area, dr.gather(mi.Float, elements.area, elements.top(patch)), patch)
+    return AFAR * dr.sqrt(area)
