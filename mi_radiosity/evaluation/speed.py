@@ -22,6 +22,7 @@ from ..solver import solve
 from ..transport import Gathering
 from .scenes import SceneFile, scene_file
 
+FEW = 32  # entries of a kernel that may be for scalars
 COLD = """
 import json, sys, time
 import mi_radiosity, mitsuba
@@ -102,14 +103,14 @@ def _cold_seconds(file: SceneFile, elements: int, rays: int) -> float:
 
 
 def _later_kernels(scene: "mi.Scene", elements: int, least: int, rays: int) -> int:
-    """Kernels compiled by solves after a first one; not those for one element or pair and its children, of which not
-    every solve has a case: Dr.Jit has other kernels for scalars."""
+    """Kernels compiled by solves after a first one; not those for less than FEW entries, such as one pair and its lines:
+    Dr.Jit has other kernels for scalars, of which not every solve has a case."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for seed, factor in ((1, 1), (2, 0.5), (3, 2)):
             solve(scene, elements=max(least, int(elements * factor)), rays=int(rays * factor), seed=seed)
         kernels = dr.kernel_history((dr.KernelType.JIT,))
-        compiled = sum(not k["cache_hit"] and k["size"] > 4 for k in kernels)
+        compiled = sum(not k["cache_hit"] and k["size"] >= FEW for k in kernels)
     dr.kernel_history_clear()
     return compiled
 
