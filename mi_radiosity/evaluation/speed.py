@@ -103,8 +103,8 @@ def _cold_seconds(file: SceneFile, elements: int, rays: int) -> float:
 
 
 def _later_kernels(scene: "mi.Scene", elements: int, least: int, rays: int) -> int:
-    """Kernels compiled by solves after a first one; not those for less than FEW entries, such as one pair and its lines:
-    Dr.Jit has other kernels for scalars, of which not every solve has a case."""
+    """Kernels compiled by solves after a first one; not those for less than FEW entries, such as one pair and its
+    lines: Dr.Jit has other kernels for scalars, of which not every solve has a case."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for seed, factor in ((1, 1), (2, 0.5), (3, 2)):

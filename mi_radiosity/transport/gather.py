@@ -57,8 +57,8 @@ class Gatherer:
     leaves. Where ``sharp``, the part of it that elements receive (Color3f [elements], W/m²), is known, only those look
     that are nearer to where they end than a random share of its element's size, AFAR times that: from afar nobody sees
     how light is spread over an element. Each sample is one line to the lamps, or one cosine-distributed ray, and its
-    value an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs them,
-    so that no estimate exceeds their exitance however near they are.
+    value an unbiased estimate. Where both are drawn, lamps are found by both; the balance heuristic (Veach 1997) weighs
+    them, so that no estimate exceeds their exitance however near they are.
     """
 
     def __init__(
