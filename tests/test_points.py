@@ -6,12 +6,14 @@ All seeds are fixed, so a test passes always or never; limits are those of a sta
 from itertools import combinations, product
 from statistics import NormalDist
 
+from mi_radiosity.core.arrays import opaque_index
 from mi_radiosity.core.points import (
     STEPS,
     Stream,
     cosine_direction,
     hash_pair,
     kronecker,
+    permuted,
     stream_seed,
     triangle,
     uniform,
@@ -323,3 +325,13 @@ def test_uniform_is_uniform():
         assert ok, why
     x = np.array(uniform(dr.arange(mi.UInt32, KEYS), mi.UInt32(0)))
     assert x.min() >= 0 and x.max() < 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 16, 24, 100])
+def test_permutations_are_mitsubas(count):
+    """Any number of samples, in one kernel; and each is a permutation."""
+    index = dr.arange(mi.UInt32, 50 * count)
+    order, index = mi.sample_tea_32(index // count, mi.UInt32(3))[0], index % count
+    found = np.array(permuted(index, opaque_index(count), order))
+    np.testing.assert_array_equal(found, np.array(mi.permute_kensler(index, count, order)))
+    assert (np.sort(found.reshape(50, count), axis=1) == np.arange(count)).all()

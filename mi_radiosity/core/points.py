@@ -92,3 +92,36 @@ def coordinates(x: "mi.Vector3f", e1: "mi.Vector3f", e2: "mi.Vector3f") -> "tupl
 def cosine_direction(normal: "mi.Vector3f", u: "mi.Float", v: "mi.Float") -> "mi.Vector3f":
     """Cosine-distributed unit direction about ``normal`` (Vector3f [n])."""
     return mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(u, v)))
+
+
+@dr.syntax
+def permuted(index: "mi.UInt32", count: "mi.UInt32", order: "mi.UInt32") -> "mi.UInt32":
+    """Where each of 0…count − 1 goes in the permutation that ``order`` names (UInt32 [n]).
+
+    Mitsuba's `permute_kensler` has the count in its kernel, so that every number of samples compiles anew. Source:
+    Kensler, "Correlated multi-jittered sampling", 2013.
+    """
+    mask = count - 1
+    for shift in (1, 2, 4, 8, 16):
+        mask |= mask >> shift
+    place, outside = mi.UInt32(index), dr.full(mi.Bool, True, dr.width(index))
+    while outside:
+        place = _scrambled(place, mask, order)
+        outside = place >= count
+    return (place + order) % count
+
+
+def _scrambled(x, mask, order):
+    """One round of it, within the bits of the mask."""
+    x = (x ^ order) * 0xE170893D
+    x ^= order >> 16
+    x ^= (x & mask) >> 4
+    x = (x ^ (order >> 8)) * 0x0929EB3F
+    x ^= order >> 23
+    x ^= (x & mask) >> 1
+    x *= 1 | (order >> 27)
+    for factor, shift in ((0x6935FA69, 11), (0x74DCB303, 2), (0x9E501CC3, 2)):
+        x *= factor
+        x ^= (x & mask) >> shift
+    x = (x * 0xC860A3DF) & mask
+    return x ^ (x >> 5)

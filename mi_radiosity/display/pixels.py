@@ -7,7 +7,8 @@ from typing import Protocol
 import drjit as dr
 import mitsuba as mi
 
-from ..core.points import ROUNDS, Stream, stream_seed
+from ..core.arrays import opaque_index
+from ..core.points import ROUNDS, Stream, permuted, stream_seed
 
 AT_ONCE = 1 << 23  # camera samples in one launch
 
@@ -23,7 +24,7 @@ class PixelPoints:
     """
 
     def __init__(self, pixels: int, first: int, count: int, total: int, seed: int) -> None:
-        self._count, self._total, self._dimension = count, total, 0
+        self._count, self._total, self._dimension = count, opaque_index(total), 0
         k = dr.arange(mi.UInt32, pixels * count)
         each = dr.opaque(mi.UInt32, count)
         self._pixel, self._index = k // each, dr.opaque(mi.UInt32, first) + k % each
@@ -37,7 +38,7 @@ class PixelPoints:
         self._dimension += 1
         order, x = mi.sample_tea_32(self._pixel, self._seed + self._dimension, ROUNDS)
         y, _ = mi.sample_tea_32(self._pixel ^ 0x5EED5EED, self._seed + self._dimension, ROUNDS)
-        return mi.permute_kensler(self._index, self._total, order), x, y
+        return permuted(self._index, self._total, order), x, y
 
     def next_1d(self) -> "mi.Float":
         index, x, _ = self._next()
