@@ -10,11 +10,14 @@ from ..scene.gloss import Gloss
 from ..scene.rays import Hit
 from .lamps import LampChoice
 
+CANDIDATES = 4  # points of lamps that a line is chosen from
+
 
 class Highlights:
     """What rays that follow lobes ask for at surfaces that have rough ones.
 
-    One line to a lamp that is a surface, drawn by power, and one to each of the others (Veach 1997, eq. 9.8).
+    One line to a lamp that is a surface, drawn by power and then by distance and slant from some (Talbot, Cline,
+    Egbert 2005: resampled importance), and one to each of the others (Veach 1997, eq. 9.8).
     """
 
     def __init__(self, model: Model, lamps: LampChoice) -> None:
@@ -43,19 +46,41 @@ class Highlights:
             return dr.select(on, value * light * weight, 0)
 
         if self._lamps.count:
-            lamp, density = self._lamps.draw(random.next_float32())
-            u, v = triangle(random.next_float32(), random.next_float32())
+            lamp, u, v, density, worth = self._drawn(si, random, active)
             d = patches.point(lamp, u, v) + patches.origin - si.p
             distance = dr.norm(d)
             cosine = -dr.dot(dr.gather(mi.Vector3f, patches.normal, lamp), d) / distance
-            on = active & (cosine > 0) & rays.on_top(lamp, u, v)
+            on = active & (worth > 0) & rays.on_top(lamp, u, v)
             density = dr.select(on, density * dr.square(distance) / cosine, 1)
-            total += add(d / distance, distance, lights.at(patches, lamp, u, v, on) / density, density, on)
+            light = lights.at(patches, lamp, u, v, on) * worth
+            total += add(d / distance, distance, light / density, density, on)
         for lamp in lights.free:
             direction, distance, irradiance = lamp.sample(si.p, random.next_float32(), random.next_float32())
             on = active & (dr.max(irradiance) > 0)
             total += add(direction, distance, dr.pi * irradiance, lamp.density(direction), on)
         return total
+
+    def _drawn(self, si, random, active):
+        """A point of a lamp: of some drawn by power one, in proportion to what it gives here if nothing is between; its
+        patch, u, v, density, 1/m², and by how much more than that says it stands for the others (UInt32, four Float
+        [n])."""
+        patches, n = self._model.patches, dr.width(si.p)
+        kept = dr.zeros(mi.UInt32, n), dr.zeros(mi.Float, n), dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n)
+        whole, own = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n)
+        candidates = min(CANDIDATES, self._lamps.count)
+        for _ in range(candidates):
+            lamp, density = self._lamps.draw(random.next_float32())
+            u, v = triangle(random.next_float32(), random.next_float32())
+            d = patches.point(lamp, u, v) + patches.origin - si.p
+            r2 = dr.squared_norm(d)
+            cosine = dr.maximum(-dr.dot(dr.gather(mi.Vector3f, patches.normal, lamp, active), d), 0)
+            power = dr.max(dr.gather(mi.Color3f, patches.emission, lamp, active))
+            weight = dr.select(r2 > 0, power * cosine / (density * r2 * dr.sqrt(r2)), 0)
+            whole += weight
+            takes = random.next_float32() * whole < weight
+            kept = tuple(dr.select(takes, new, old) for new, old in zip((lamp, u, v, density), kept))
+            own = dr.select(takes, weight, own)
+        return *kept, whole / (candidates * own)
 
     def density(self, x: "mi.Point3f", direction: "mi.Vector3f", hit: Hit) -> "mi.Float":
         """Density over directions, 1/sr, of the lines that find what rays from x have met: lamps, or the sky."""

@@ -2,20 +2,22 @@
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.arrays import NONE, Distribution, lower_bound_within, opaque_index, totals
-from ..mesh import Elements
+from ..mesh import MAX_LEVEL, Elements
 from ..scene import Model
 
-MOST = 1 << 24  # entries of the table of leaves and lamps; with more lamps than that, they are chosen by power
+MOST = 1 << 24  # entries of the table of elements and lamps; with more lamps than that, they are chosen by power
 BY_POWER = 0.1  # share of lines that are drawn by power whatever the place
 
 
 class LampChoice:
     """Draws points on lamps (patches that emit), for places on the leaves of a mesh.
 
-    A row per leaf holds what every lamp would give its middle were nothing between: a line is worth the more, the more
-    light it may bring. ``count``: how many lamp patches there are.
+    A row per leaf, or per element above them if there are too many lamps for all, holds what every lamp would give its
+    middle were nothing between: a line is worth the more, the more light it may bring. ``count``: how many lamp
+    patches there are.
     """
 
     def __init__(self, model: Model, elements: Elements) -> None:
@@ -31,18 +33,30 @@ class LampChoice:
         self._by_power = Distribution(power, whole)
         self._number = dr.full(mi.UInt32, NONE, self._patches.count)
         dr.scatter(self._number, dr.arange(mi.UInt32, self.count), self.lamps)
-        if 1 < self.count and self.count * dr.width(elements.leaves) <= MOST:
-            self._build_rows(mi.Float(power / dr.opaque(mi.Float64, whole)))
+        level = self._finest_level()
+        if 1 < self.count and level is not None:
+            self._build_rows(mi.Float(power / dr.opaque(mi.Float64, whole)), opaque_index(level))
 
-    def _build_rows(self, share):
-        """Cumulative shares of all lamps, leaf by leaf (Float [leaves · lamps])."""
-        p, e, leaves = self._patches, self._elements, self._elements.leaves
-        k = dr.arange(mi.UInt32, self.count * dr.width(leaves))
+    def _finest_level(self):
+        """The finest level that the table may have rows for, or for leaves above it; None if it may for none."""
+        e = self._elements
+        every, leaf = (np.bincount(np.array(e.level(x)), minlength=MAX_LEVEL + 1) for x in (_all(e), e.leaves))
+        rows = every + np.cumsum(leaf) - leaf  # elements of each level, and leaves above
+        fits = np.flatnonzero(self.count * rows <= MOST)
+        return int(fits[-1]) if len(fits) else None
+
+    def _build_rows(self, share, level):
+        """Cumulative shares of all lamps, element by element (Float [elements · lamps])."""
+        p, e = self._patches, self._elements
+        at = _all(e)
+        on_level, is_leaf = e.level(at) == level, dr.gather(mi.UInt32, e.child, at) == 0
+        places = dr.gather(mi.UInt32, at, dr.compress(on_level | (is_leaf & (e.level(at) < level))))
+        k = dr.arange(mi.UInt32, self.count * dr.width(places))
         row, lamp = k // opaque_index(self.count), k % opaque_index(self.count)
-        leaf, j = dr.gather(mi.UInt32, leaves, row), dr.gather(mi.UInt32, self.lamps, lamp)
-        i, third = dr.gather(mi.UInt32, e.patch, leaf), mi.Float(1 / 3)
-        d = p.point(j, third, third) - p.point(i, *e.patch_point(leaf, third, third))
-        spread = dr.gather(mi.Float, e.area, leaf) + dr.gather(mi.Float, p.area, j)
+        place, j = dr.gather(mi.UInt32, places, row), dr.gather(mi.UInt32, self.lamps, lamp)
+        i, third = dr.gather(mi.UInt32, e.patch, place), mi.Float(1 / 3)
+        d = p.point(j, third, third) - p.point(i, *e.patch_point(place, third, third))
+        spread = dr.gather(mi.Float, e.area, place) + dr.gather(mi.Float, p.area, j)
         r2 = dr.squared_norm(d)
         # Cosines of the middle, and what the sizes of both may add to them.
         slack = dr.sqrt(dr.minimum(spread / dr.maximum(r2, 1e-30), 1))
@@ -55,7 +69,12 @@ class LampChoice:
         chance = dr.select(total > 0, (1 - BY_POWER) * guess / total, (1 - BY_POWER) * share) + BY_POWER * share
         self._rows = dr.block_prefix_reduce(dr.ReduceOp.Add, chance, self.count, exclusive=False)
         self._row = dr.full(mi.UInt32, NONE, len(e))
-        dr.scatter(self._row, dr.arange(mi.UInt32, dr.width(leaves)), leaves)
+        dr.scatter(self._row, dr.arange(mi.UInt32, dr.width(places)), places)
+        above = _above(e, level)
+        below = dr.compress(above != e.leaves)
+        dr.eval(self._row)
+        rows = dr.gather(mi.UInt32, self._row, dr.gather(mi.UInt32, above, below))
+        dr.scatter(self._row, rows, dr.gather(mi.UInt32, e.leaves, below))
         dr.eval(self._rows, self._row)
 
     def draw(self, lot: "mi.Float", leaf: "mi.UInt32 | None" = None) -> "tuple[mi.UInt32, mi.Float]":
@@ -93,3 +112,20 @@ class LampChoice:
             top = dr.gather(mi.Float, self._rows, first + opaque_index(self.count - 1))
             probability = (dr.gather(mi.Float, self._rows, at) - dr.select(number > 0, before, 0)) / top
         return probability / dr.gather(mi.Float, self._patches.area, dr.gather(mi.UInt32, self.lamps, number))
+
+
+def _all(elements):
+    """All elements of patches (UInt32 [n])."""
+    every = dr.arange(mi.UInt32, len(elements))
+    if elements.crown is None:
+        return every
+    return dr.compress(~elements.crown.holds(every))
+
+
+@dr.syntax
+def _above(elements, level):
+    """The elements of a level above leaves, or the leaves themselves (UInt32 [leaves])."""
+    element = mi.UInt32(elements.leaves)
+    while elements.level(element) > level:
+        element = dr.gather(mi.UInt32, elements.parent, element)
+    return element
