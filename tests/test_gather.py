@@ -4,6 +4,7 @@ import mi_radiosity as mr
 from mi_radiosity.display.pixels import PixelPoints
 from mi_radiosity.evaluation.metrics import rmse
 from mi_radiosity.evaluation.reference import path_image
+from mi_radiosity.transport import lamps as lamps_of_places
 from mi_radiosity.transport.lamps import LampChoice
 
 import drjit as dr
@@ -143,8 +144,11 @@ def test_walls_keep_gathered_light():
 # ---- Lamps -----------------------------------------------------------------------------------------
 
 
-def test_lamps_are_drawn_as_often_as_their_density_says():
-    """χ² at 99.9 %: for places on three leaves, and for places nobody knows."""
+@pytest.mark.parametrize("most, places", [(1 << 24, 200), (1000, 100), (5, 1)])
+def test_lamps_are_drawn_as_often_as_their_density_says(most, places, monkeypatch):
+    """χ² at 99.9 %: for places on three leaves, and for places nobody knows; with a row of lamps for every leaf, for
+    elements above them, and with none."""
+    monkeypatch.setattr(lamps_of_places, "MOST", most)
     lamps = {
         f"lamp{k}": rectangle(
             T().translate([k - 2, 0, 2]).rotate([1, 0, 0], 180).scale(0.2 + 0.1 * k), emitter=lamp(1 + k)
@@ -153,6 +157,14 @@ def test_lamps_are_drawn_as_often_as_their_density_says():
     }
     solution = mr.solve(scene(floor=rectangle(T().scale(4), bsdf=diffuse()), **lamps), elements=200, rays=20_000)
     choice, n = LampChoice(solution.model, solution.elements), 100_000
+    leaves = np.array(solution.elements.leaves)
+    rows = np.stack(
+        [
+            np.array(choice.density(dr.full(mi.UInt32, int(p), len(leaves)), mi.UInt32(leaves)))
+            for p in np.array(choice.lamps)
+        ]
+    )
+    assert 0.3 * places < len(np.unique(rows, axis=1).T) <= places
     area = np.array(solution.model.patches.area)
     lot = mi.Float(np.random.default_rng(0).random(n).astype(np.float32))
     for leaf in (None, *np.array(solution.elements.leaves)[[0, 50, 150]]):
