@@ -23,45 +23,20 @@ class Crown:
     """
 
     def __init__(self, patches: Patches, labels: Sequence[np.ndarray]) -> None:
-        n = patches.count
-        self._patches = n
-        member = np.lexsort(labels[::-1])
-        area = np.array(patches.area, dtype=np.float64)[member]
-        clusters, links, ways = [], [], np.zeros((len(labels) + 1, n), dtype=np.uint32)
-        name, size, depth, count = np.full(n, -1), np.full(n, n + 1), np.zeros(n, dtype=np.int64), 0
-        for label in [*labels, np.arange(n)]:
-            start = np.flatnonzero(np.diff(label[member], prepend=-1))
-            width = np.diff(start, append=n)
-            new, single = width < size[start], width == 1  # a cluster that is all of another is left out
-            made = new & ~single
-            here = np.where(single, member[start], np.where(made, n + count + np.cumsum(made) - 1, name[start]))
-            count += int(made.sum())
-            above = new & (name[start] >= 0)
-            parent = name[start[above]]
-            run = np.flatnonzero(np.diff(parent, prepend=-1))  # parts of one are side by side
-            order = np.arange(len(parent)) - np.repeat(run, np.diff(run, append=len(parent)))
-            links.append(np.column_stack([parent, order, here[above]]))
-            each, inside = width[above], np.repeat(above, width)
-            ways[depth[inside] - 1, np.flatnonzero(inside)] = np.repeat(order, each)
-            clusters.append(np.column_stack([start, start + width, depth[start]])[made])
-            depth += np.repeat(made, width)
-            name, size = np.repeat(here, width), np.repeat(width, width)
-            if label is labels[0]:
-                roots, root_of = here, np.repeat(np.arange(len(here)), width)
-        start, end, depth = np.concatenate(clusters).T
-        parent, order, part = np.concatenate(links).T
-        rows = np.lexsort([order, parent])
-        parts = np.bincount(parent - n, minlength=count)
-        until = np.concatenate([[0], np.cumsum(area)])
+        self._patches, nest = patches.count, _Nest(labels)
+        self._area = np.array(patches.area, dtype=np.float64)[nest.member]
+        until = np.concatenate([[0], np.cumsum(self._area)])
+        start, end, depth = nest.clusters.T
+        parent, order, part = nest.parts.T
+        parts = np.bincount(parent - patches.count, minlength=len(start))
         self.area = until[end] - until[start]
         self.start, self.end, self.depth = (owned(mi.UInt32, x) for x in (start, end, depth))
-        self.first, self.parts, self.part = (owned(mi.UInt32, x) for x in (np.cumsum(parts) - parts, parts, part[rows]))
-        self.roots, self.member = owned(mi.UInt32, roots), owned(mi.UInt32, member)
-        self.root_of, self._ways = (np.empty(n), np.empty_like(ways))
-        self.root_of[member], self._ways[:, member] = root_of, ways
-        self.root_of, self._ways = owned(mi.UInt32, self.root_of), owned(mi.UInt32, self._ways.ravel())
-        self._until = owned(mi.Float64, until)
-        self._sum_area, self._member, self._ends = area, member, (start, end)
+        self.first, self.parts = owned(mi.UInt32, np.cumsum(parts) - parts), owned(mi.UInt32, parts)
+        self.part = owned(mi.UInt32, part[np.lexsort([order, parent])])
+        self.member, self.roots = owned(mi.UInt32, nest.member), owned(mi.UInt32, nest.roots)
+        back = np.argsort(nest.member)  # from places to patches
+        self.root_of, self._ways = owned(mi.UInt32, nest.root_of[back]), owned(mi.UInt32, nest.ways[:, back].ravel())
+        self._until, self._rows = owned(mi.Float64, until), (nest.member, start, end)
 
     def __len__(self) -> int:
         return dr.width(self.start)
@@ -97,6 +72,47 @@ class Crown:
 
     def means(self, values: np.ndarray) -> np.ndarray:
         """Values of patches averaged over clusters by area [patches, 3] ─► [clusters, 3]."""
-        until = np.concatenate([np.zeros((1, 3)), np.cumsum(values[self._member] * self._sum_area[:, None], axis=0)])
-        start, end = self._ends
+        member, start, end = self._rows
+        until = np.concatenate([np.zeros((1, 3)), np.cumsum(values[member] * self._area[:, None], axis=0)])
         return (until[end] - until[start]) / self.area[:, None]
+
+
+class _Nest:
+    """Patches in an order in which every cluster is a run of places: ``member`` [places].
+
+    Per cluster: where it starts and ends, and how many clusters it is in (``clusters`` [n, 3]). Per part: the cluster,
+    its number there, and the element that it is (``parts`` [n, 3]). Per place: the number of the part it is in of the
+    k-th cluster that it is in (``ways`` [k, places]), and of the root (``root_of``) among ``roots``.
+    """
+
+    def __init__(self, labels: Sequence[np.ndarray]) -> None:
+        n = len(labels[0])
+        self.member = np.lexsort(labels[::-1])
+        self.ways = np.zeros((len(labels) + 1, n), dtype=np.uint32)
+        element, size, depth = np.full(n, -1), np.full(n, n + 1), np.zeros(n, dtype=np.int64)  # by place, so far
+        clusters: list[np.ndarray] = []
+        parts: list[np.ndarray] = []
+        count = 0
+        for label in [*labels, np.arange(n)]:
+            start = np.flatnonzero(np.diff(label[self.member], prepend=-1))
+            width = np.diff(start, append=n)
+            new, single = width < size[start], width == 1  # what is all of a larger one is that
+            made = new & ~single
+            here = np.where(single, self.member[start], np.where(made, n + count + np.cumsum(made) - 1, element[start]))
+            count += int(made.sum())
+            if not clusters:
+                self.roots, self.root_of = here, np.repeat(np.arange(len(here)), width)
+            is_part = new & (element[start] >= 0)
+            parent, inside = element[start[is_part]], np.repeat(is_part, width)
+            order = _numbers_in_runs(parent)
+            parts.append(np.column_stack([parent, order, here[is_part]]))
+            self.ways[depth[inside] - 1, np.flatnonzero(inside)] = np.repeat(order, width[is_part])
+            clusters.append(np.column_stack([start, start + width, depth[start]])[made])
+            element, size, depth = np.repeat(here, width), np.repeat(width, width), depth + np.repeat(made, width)
+        self.clusters, self.parts = np.concatenate(clusters), np.concatenate(parts)
+
+
+def _numbers_in_runs(values):
+    """0, 1, 2, … for neighbours of the same value (int [n])."""
+    start = np.flatnonzero(np.diff(values, prepend=-1))
+    return np.arange(len(values)) - np.repeat(start, np.diff(start, append=len(values)))

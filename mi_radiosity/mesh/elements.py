@@ -196,10 +196,11 @@ class Tree(Elements):
         self._materials, self._lights, self.leaf_count = materials, lights, n
         if lights.textured:
             self.exitance = mi.Color3f(patches.emission)
-        if labels:
-            self._crown(Crown(patches, labels))
+        crown = Crown(patches, labels) if labels else ()
+        if len(crown):
+            self._put_on(crown)
 
-    def _crown(self, crown):
+    def _put_on(self, crown):
         """Put clusters above the patches."""
         n, m = self.patches.count, len(crown)
         first = dr.gather(mi.UInt32, crown.member, crown.start)

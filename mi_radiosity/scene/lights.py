@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
@@ -18,6 +19,7 @@ from .state import parameters
 LIGHTS = Registry("emitter")
 LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
 SAMPLES = 1 << 18  # rays that a lamp's power is averaged over
+GLANCES = 1 << 12  # directions in which a sky is looked at for a sun
 SHARP = 300 / (4 * np.pi)  # density over directions, 1/sr, of parts of a sky that are as small and bright as a sun
 
 
@@ -187,9 +189,16 @@ class Infinite(Free):
         "TimedSunskyEmitter",
     )
 
-    @property
+    @cached_property
     def may_be_sharp(self) -> bool:
-        return self.emitter.class_name() != "ConstantBackgroundEmitter"
+        """As some directions drawn by what they bring tell: a sun is among them."""
+        if not self.is_sky:
+            return True
+        s, t, _, _ = kronecker(dr.arange(mi.UInt32, GLANCES), opaque_index(0), opaque_index(0))
+        direction = self.sample(
+            dr.zeros(mi.Point3f, GLANCES) + mi.Point3f(*map(float, self.low + self.high)) / 2, s, t
+        )[0]
+        return bool(dr.any(self.is_sharp(direction)))
 
     def is_sharp(self, direction: "mi.Vector3f") -> "mi.Bool":
         """All of a lamp of one direction; of a sky the sun, and what else is like it."""
