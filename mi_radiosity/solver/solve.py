@@ -10,6 +10,7 @@ import numpy as np
 from ..core.errors import RadiosityError, interruptible
 from ..core.points import Stream, stream_seed
 from ..mesh import Clusters, Exposure, Pairs, Tree, cluster_labels, crossed_leaves
+from ..mesh.clusters import count_of
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
@@ -140,7 +141,7 @@ def _clusters(model, shared, given):
     crossed = np.zeros(model.patches.count, dtype=bool)
     crossed[np.array(crossed_leaves(patches, model.rays))] = True
     labels = cluster_labels(model.faces, model.patches, crossed, top_of(shared))
-    count = len(np.unique(labels[0]))
+    count = count_of(labels[0])
     if given and count > shared:
         raise RadiosityError(
             f"{shared} elements cannot be reached: of {model.patches.count} patches only neighbours of one shape and "
