@@ -1,12 +1,14 @@
 """Clusters of faces: what they are, that they keep all light, and that they look like the faces themselves."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import mi_radiosity as mr
 from mi_radiosity.core.points import kronecker
 from mi_radiosity.evaluation import ladder
 from mi_radiosity.mesh import Clusters, Pairs, Tree, cluster_labels
 from mi_radiosity.scene import Model
+from mi_radiosity.solver.cost import plan
 
 import drjit as dr
 import mitsuba as mi
@@ -198,6 +200,24 @@ def test_clusters_in_a_furnace():
     solution = mr.solve(mi.load_dict({"type": "scene", "box": shape}), mr.Uniform(), elements=768, rays=200_000)
     leaves = solution.leaves()
     assert np.average(leaves.radiosity[:, 0], weights=leaves.area) == pytest.approx(2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "patches, elements, wanted, shares",
+    [
+        (1_118, 19_000, 19_000, False),
+        (1_118, 1_000, 1_000, True),
+        (1_118, None, 20_118, False),
+        (56_963, 57_000, 57_000, True),
+        (56_963, 120_000, 120_000, False),
+        (56_963, None, 75_963, False),
+        (250_000, None, 114_000, True),
+    ],
+)
+def test_who_shares(patches, elements, wanted, shares):
+    """Clusters where there are fewer elements than faces, or too few for the large faces among many small ones."""
+    model = SimpleNamespace(patches=SimpleNamespace(count=patches))
+    assert plan(model, elements, None) == (wanted, wanted if shares else None)
 
 
 def test_too_few_elements_are_refused_with_the_fewest(model):

@@ -66,13 +66,15 @@ def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int
     """Elements to refine to, None where ε decides; the same again if patches share them, else None.
 
     Faces that are smaller than the light needs share: where fewer elements are asked for than there are faces, or where
-    there are very many by default.
+    there are very many by default; and where there are many faces, and less than twice as many elements, lest few of
+    them be left for the large ones.
     """
     count = model.patches.count
     if epsilon is not None:
         return None, None
     wanted = min(count + ELEMENTS, SHARED) if elements is None else elements
-    shares = count + ELEMENTS > SHARED if elements is None else elements < count
+    enough = 2 * count if count > ELEMENTS else count
+    shares = count + ELEMENTS > SHARED if elements is None else elements < enough
     return wanted, wanted if shares else None
 
 
