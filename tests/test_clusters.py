@@ -212,6 +212,7 @@ def test_clusters_in_a_furnace():
         (56_963, 120_000, 120_000, False),
         (56_963, None, 75_963, False),
         (250_000, None, 114_000, True),
+        (894_255, 913_255, 913_255, False),
     ],
 )
 def test_who_shares(patches, elements, wanted, shares):

@@ -66,15 +66,17 @@ def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int
     """Elements to refine to, None where ε decides; the same again if patches share them, else None.
 
     Faces that are smaller than the light needs share: where fewer elements are asked for than there are faces, or where
-    there are very many by default; and where there are many faces, and less than twice as many elements, lest few of
-    them be left for the large ones.
+    there are very many by default; and where there are many faces and so few more elements that clusters of a tenth of
+    the faces, or more, would leave the oracle some to split large faces with.
     """
     count = model.patches.count
     if epsilon is not None:
         return None, None
     wanted = min(count + ELEMENTS, SHARED) if elements is None else elements
-    enough = 2 * count if count > ELEMENTS else count
-    shares = count + ELEMENTS > SHARED if elements is None else elements < enough
+    if elements is None:
+        shares = count + ELEMENTS > SHARED
+    else:
+        shares = elements < count or (count > ELEMENTS and top_of(elements) < 0.9 * count)
     return wanted, wanted if shares else None
 
 
