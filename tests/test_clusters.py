@@ -202,6 +202,19 @@ def test_clusters_in_a_furnace():
     assert np.average(leaves.radiosity[:, 0], weights=leaves.area) == pytest.approx(2, rel=1e-3)
 
 
+def test_kept_with_their_clusters(model, tmp_path):
+    """A solution that was saved has the same leaves, areas and light, and gathers the same, once it is loaded."""
+    solution = mr.solve(model, elements=4_000, rays=50_000)
+    solution.save(tmp_path / "kept.npz")
+    loaded = mr.Solution.load(tmp_path / "kept.npz", model)
+    one, two = solution.elements, loaded.elements
+    np.testing.assert_array_equal(np.array(one.leaves), np.array(two.leaves))
+    np.testing.assert_allclose(np.array(one.area), np.array(two.area), rtol=1e-6)
+    patch = dr.arange(mi.UInt32, model.patches.count)
+    np.testing.assert_array_equal(np.array(one.top(patch)), np.array(two.top(patch)))
+    np.testing.assert_array_equal(np.array(solution.irradiance()), np.array(loaded.irradiance()))
+
+
 @pytest.mark.parametrize(
     "patches, elements, wanted, shares",
     [

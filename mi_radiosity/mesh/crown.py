@@ -18,12 +18,12 @@ class Crown:
     [clusters], m²). ``roots`` (UInt32): elements that no cluster is above, and ``root_of`` (UInt32 [patches]) their
     number.
 
-    labels: of the patches, the same for those of one cluster, the largest clusters first (int [patches] each).
+    labels: of the patches, the same for those of one cluster, the largest clusters first (int [patches] each); kept.
     Source: Willmott, Heckbert, Garland: "Face cluster radiosity", 1999.
     """
 
     def __init__(self, patches: Patches, labels: Sequence[np.ndarray]) -> None:
-        self._patches, nest = patches.count, _Nest(labels)
+        self._patches, self.labels, nest = patches.count, labels, _Nest(labels)
         self._area = np.array(patches.area, dtype=np.float64)[nest.member]
         until = np.concatenate([[0], np.cumsum(self._area)])
         start, end, depth = nest.clusters.T

@@ -12,12 +12,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import NONE, owned, owned_vectors
+from ..core.arrays import NONE, opaque_index, owned, owned_vectors
 from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
 from ..mesh import Elements, Exposure
+from ..mesh.crown import Crown
 from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
 from ..scene import Model
@@ -260,6 +261,8 @@ class Solution:
         arrays |= {name: np.array(h, dtype=np.float32).reshape(3, -1) for name, h in parts.items() if h is not None}
         arrays |= self.layers.arrays() if self.layers else {}
         arrays |= {"landings": np.array([self.landings.u, self.landings.v]).reshape(2, -1)}
+        if e.crown:
+            arrays["clusters"] = np.array(e.crown.labels)
         with writing(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -297,11 +300,15 @@ class Solution:
         reflectance, direct, indirect = (owned_vectors(mi.Color3f, data[name].T) for name in COLORS)
         arrays = {name: owned(mi.Float if data[name].dtype.kind == "f" else mi.UInt32, data[name]) for name in TREE}
         area = dr.gather(mi.Float, model.patches.area, arrays["patch"]) * arrays["scale"] ** 2
-        exitance = None
+        crown, exitance = None, None
+        if "clusters" in data:
+            crown = Crown(model.patches, list(data["clusters"]))
+            above = opaque_index(model.patches.count) + dr.arange(mi.UInt32, len(crown))
+            dr.scatter(area, owned(mi.Float, crown.area), above)
         if model.lights.textured:
             frame = (arrays[name] for name in ("patch", "u0", "v0", "scale"))
             exitance = mean_exitance(model.patches, model.lights, *frame)
-        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance}, exitance)
+        elements = Elements(model.patches, arrays | {"area": area, "reflectance": reflectance}, exitance, crown)
         crossed = owned(mi.UInt32, data["crossed"]) == 1
         slots = int((data["slot"] != NONE).sum())
         exposure = Exposure(owned(mi.Float, data["open_area"]), crossed, owned(mi.UInt32, data["slot"]), slots)
