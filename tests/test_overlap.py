@@ -2,8 +2,11 @@
 
 from fractions import Fraction
 
+from mi_radiosity.scene.lookup import EDGE, Lookup
 from mi_radiosity.scene.overlap import coplanar_pairs
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -103,3 +106,39 @@ def test_finds_every_pair(seed):
             if move > (tolerance * GRID / 2) ** 2:
                 some.add((f, g))
     assert len(deep) > 20 and deep <= found <= some
+
+
+def test_owners_of_points_under_many_faces():
+    """A point belongs to the uppermost face it lies on, of thousands on two others of any shape and place, whichever
+    of them share the cell it is in."""
+    random, count, points = np.random.default_rng(5), 1500, 3000
+    ground = np.array([[[0, 0, 0], [9, 1, 0], [2, 8, 0]], [[-3, 7, 0], [2, 8, 0], [0, 0, 0]]], dtype=np.float64)
+    u, v = random.random((2, count))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    on = random.integers(0, 2, count)
+    middle = ground[on, 0] + u[:, None] * (ground[on, 1] - ground[on, 0]) + v[:, None] * (ground[on, 2] - ground[on, 0])
+    size = 0.02 * 100 ** random.random((count, 1, 1))
+    corners = middle[:, None] + size * np.append(random.normal(size=(count, 3, 2)), np.zeros((count, 3, 1)), axis=2)
+    corners = np.concatenate([ground, corners])
+    order = np.argsort(on, kind="stable")
+    lookup = Lookup(corners, 2 * on[order], 2 * (2 + order))
+
+    a, b = random.random((2, points))
+    a, b = np.where(a + b > 1, 1 - a, a), np.where(a + b > 1, 1 - b, b)
+    where = random.integers(0, 2, points)
+    face, back, _, _ = lookup.owner(
+        mi.UInt32(where), dr.full(mi.Bool, False, points), mi.Float(a), mi.Float(b), dr.full(mi.Bool, True, points)
+    )
+    p0, e1, e2 = ground[where, 0], *(ground[where, k] - ground[where, 0] for k in (1, 2))
+    x = p0 + a[:, None] * e1 + b[:, None] * e2
+    q0, q1, q2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    wide = q1[:, 0] * q2[:, 1] - q1[:, 1] * q2[:, 0]
+    d = x[:, None] - q0[None, 2:]
+    s = (d[..., 0] * q2[2:, 1] - d[..., 1] * q2[2:, 0]) / wide[2:]
+    t = (q1[2:, 0] * d[..., 1] - q1[2:, 1] * d[..., 0]) / wide[2:]
+    nearest = np.minimum(np.minimum(s, t), 1 - s - t)
+    there = on[None] == where[:, None]
+    owner = np.where((there & (nearest >= -EDGE)).any(axis=1), 2 + np.argmax(there & (nearest >= -EDGE), axis=1), where)
+    clear = (~there | (np.abs(nearest + EDGE) > 1e-4)).all(axis=1)  # rounding may decide at edges
+    assert clear.mean() > 0.5 and (owner[clear] > 1).mean() > 0.2
+    assert (np.array(face)[clear] == owner[clear]).all() and not np.array(back).any()

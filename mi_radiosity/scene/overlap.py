@@ -6,12 +6,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import components, opaque_index, owned, owned_vectors
-from ..core.points import coordinates
+from ..core.arrays import components, opaque_index, owned
 from .faces import Faces
+from .lookup import EDGE, Lookup
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
-EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
 CORNERS = 8  # of a box
 GUESS = 12  # pairs of faces that are near each other, per face
 FINEST = 30  # a grid has up to 2^30 cells along an axis
@@ -48,43 +47,9 @@ class Overlaps:
         faces = np.unique(np.concatenate([under[doubled], over[doubled]]) // 2)
         return Overlaps(self.corners, self.present, under, over, self.covered), faces
 
-    def lookup(self, centre: np.ndarray) -> "Lookup | None":
+    def lookup(self, centre: np.ndarray) -> Lookup | None:
         """The same on the device, for points relative to ``centre``; None if nothing overlaps."""
-        return Lookup(self, centre) if len(self.under) else None
-
-
-class Lookup:
-    """Overlaps as tables on the device; ``under`` and ``over`` as there."""
-
-    def __init__(self, overlaps: Overlaps, centre: np.ndarray) -> None:
-        corner = overlaps.corners - centre
-        edges = [corner[:, k] - corner[:, 0] for k in (1, 2)]
-        self._triangles = [owned_vectors(mi.Point3f, corner[:, 0]), *(owned_vectors(mi.Vector3f, e) for e in edges)]
-        self._starts = owned(mi.UInt32, np.searchsorted(overlaps.under, np.arange(overlaps.covered.size + 1)))
-        self.under, self.over = overlaps.under, overlaps.over
-        self._over = owned(mi.UInt32, overlaps.over)
-
-    @dr.syntax
-    def owner(
-        self, face: "mi.UInt32", back: "mi.Bool", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool"
-    ) -> "tuple[mi.UInt32, mi.Bool, mi.Float, mi.Float]":
-        """The face, side and coordinates that points (u, v) of sides belong to (UInt32, Bool, Float, Float)."""
-        side = 2 * face + dr.select(back, mi.UInt32(1), mi.UInt32(0))
-        p0, e1, e2 = (dr.gather(type(t), t, face, active) for t in self._triangles)
-        x = p0 + e1 * u + e2 * v
-        at = dr.gather(mi.UInt32, self._starts, side, active)
-        end = dr.gather(mi.UInt32, self._starts, side + 1, active)
-        u, v = mi.Float(u), mi.Float(v)
-        while active & (at < end):
-            other = dr.gather(mi.UInt32, self._over, at)
-            q0, q1, q2 = (dr.gather(type(t), t, other >> 1) for t in self._triangles)
-            a, b = coordinates(x - q0, q1, q2)
-            inside = (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)
-            side = dr.select(inside, other, side)
-            u = dr.select(inside, dr.clip(a, 0, 1), u)
-            v = dr.select(inside, dr.clip(b, 0, 1), v)
-            at = dr.select(inside, end, at + 1)
-        return side >> 1, (side & 1) == 1, u, v
+        return Lookup(self.corners - centre, self.under, self.over) if len(self.under) else None
 
 
 def find_overlaps(

@@ -10,8 +10,8 @@ from ..core.arrays import NONE, owned_vectors
 from ..core.points import cosine_direction
 from .faces import Faces
 from .lobes import Lobes, Trail
+from .lookup import Lookup
 from .materials import Materials
-from .overlap import Lookup
 from .patches import Patches, patch_table
 
 
