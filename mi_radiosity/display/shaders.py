@@ -7,7 +7,7 @@ import mitsuba as mi
 
 from ..core.plugins import Registry
 from ..core.points import coordinates, cosine_direction
-from ..scene.rays import Hit
+from ..scene.hit import Hit
 from ..solver import Field, Solution
 from ..transport import Places
 

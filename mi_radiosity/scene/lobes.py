@@ -1,6 +1,5 @@
 """Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -9,38 +8,10 @@ import mitsuba as mi
 from ..core.arrays import NONE
 from ..core.points import ROUNDS
 from .gloss import Gloss
+from .hit import Hit, Trail
 
 ROULETTE = 5  # lobes after which a ray may end by chance
 MOST = 64  # lobes after which it ends
-
-
-@dataclass
-class Trail:
-    """Where rays end that went on through lobes; [rays], like a `Hit`, which it can stand for.
-
-    ``patch`` is NONE for rays that escape (not ``valid``) or end without a diffuse lobe. ``traced`` says that rays met
-    a surface with other lobes than a diffuse one. ``weight``: what is left of a ray at its end; where that surface has
-    other lobes, too, times the weight of the diffuse lobe that was drawn over its mean ρ, so that the mean is right.
-    ``taken``: power that the lobes on the way kept, less what they sent on from surfaces that count all of
-    theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
-    the end included (it is ``coated``), and of lamps that lines from rough lobes have found, times the weight there,
-    W/m². ``share``: of the lamp that the end is on, or of the sky, what those lines leave to the ray. ``rough``: the
-    first lobe on the way is one that such lines look from.
-    """
-
-    valid: "mi.Bool"
-    patch: "mi.UInt32"
-    u: "mi.Float"
-    v: "mi.Float"
-    direction: "mi.Vector3f"  # at the end
-    weight: "mi.Color3f"
-    bounced: "mi.Bool"  # it went through a lobe
-    traced: "mi.Bool"
-    coated: "mi.Bool"
-    taken: "mi.Color3f"
-    glow: "mi.Color3f"
-    share: "mi.Float"
-    rough: "mi.Bool"
 
 
 class Lobes:
@@ -54,7 +25,6 @@ class Lobes:
         seed: "mi.UInt32",
         mode: "mi.TransportMode",
         camera: bool,
-        active: "mi.Bool | bool" = True,
         highlights: Any = None,
     ) -> Trail:
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
@@ -65,29 +35,13 @@ class Lobes:
         """
         ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
-        alive, no = mi.Bool(active) & dr.full(mi.Bool, True, n), dr.zeros(mi.Bool, n)
-        nought, black = dr.zeros(mi.Float, n), dr.zeros(mi.Color3f, n)
-        nowhere = dr.full(mi.UInt32, NONE, n)
-        start = Trail(
-            valid=no,
-            patch=nowhere,
-            u=nought,
-            v=nought,
-            direction=mi.Vector3f(ray.d),
-            weight=black + 1,
-            bounced=no,
-            traced=no,
-            coated=no,
-            taken=black,
-            glow=black,
-            share=nought + 1,
-            rough=no,
-        )
+        nought, no = dr.zeros(mi.Float, n), dr.zeros(mi.Bool, n)
+        start = Trail.straight(Hit(no, dr.full(mi.UInt32, NONE, n), nought, nought, no, no), ray.d)
 
         def step(alive, ray, pdf, depth, random, trail):
             return self._step(rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail)
 
-        state = (alive, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
+        state = (~no, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
         return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
 
     def _step(self, rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail):

@@ -1,6 +1,5 @@
 """Rays between patches: where they end, what they miss, and the kernel F along them."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -9,22 +8,11 @@ import mitsuba as mi
 from ..core.arrays import NONE, owned_vectors
 from ..core.points import cosine_direction
 from .faces import Faces
-from .lobes import Lobes, Trail
+from .hit import Hit, Trail
+from .lobes import Lobes
 from .lookup import Lookup
 from .materials import Materials
 from .patches import Patches, patch_table
-
-
-@dataclass
-class Hit:
-    """Where rays end. ``patch`` is NONE on the sides of faces that take no part in light transport."""
-
-    valid: "mi.Bool"  # [rays] something was hit
-    patch: "mi.UInt32"  # [rays]
-    u: "mi.Float"  # [rays] barycentric coordinates on the face
-    v: "mi.Float"
-    back: "mi.Bool"  # [rays] the side they meet is the back of its face
-    traced: "mi.Bool"  # [rays] the surface has lobes that are not diffuse
 
 
 class Rays:
@@ -82,10 +70,24 @@ class Rays:
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
         camera: they look for light, and the first surface's own counts. highlights: see `Lobes.follow`.
         """
+        hit = self.trace(origin, direction, active)
         if self.lobes is None:
-            return self.trace(origin, direction, active)
+            return hit
+        # Few go on: packed side by side, they do not keep the others waiting.
+        every = dr.zeros(mi.UInt32, dr.width(direction))
+        states = [mi.Point3f(origin + every), direction, number + every, seed + every]
+        dr.eval(states, hit)
+        on = dr.compress(hit.traced)
+        end = Trail.straight(hit, direction)
+        if dr.width(on) == 0:
+            return end
+        origin, direction, number, seed = (dr.gather(type(x), x, on) for x in states)
         mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
-        return self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, active, highlights)
+        followed = self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, highlights)
+        dr.eval(followed)
+        row = dr.full(mi.UInt32, NONE, dr.width(every))
+        dr.scatter(row, dr.arange(mi.UInt32, dr.width(on)), on)
+        return end.replaced(row, followed)
 
     def on_top(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Bool":
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""

@@ -4,8 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE
-from ..scene.lobes import Trail
-from ..scene.rays import Hit
+from ..scene.hit import Hit, Trail
 from .emit import Batch
 from .problem import Problem
 

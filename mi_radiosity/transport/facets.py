@@ -16,7 +16,7 @@ from ..mesh import Elements
 from ..mesh.exposure import is_covered
 from ..mesh.subdivision import NODES
 from ..scene import Model
-from ..scene.rays import Hit
+from ..scene.hit import Hit
 from .emit import launches
 
 LEVELS = ("shape", "face", "leaf")

@@ -7,7 +7,7 @@ from ..core.arrays import NONE
 from ..core.points import triangle
 from ..scene import Model
 from ..scene.gloss import Gloss
-from ..scene.rays import Hit
+from ..scene.hit import Hit
 from .lamps import LampChoice
 
 CANDIDATES = 4  # points of lamps that a line is chosen from

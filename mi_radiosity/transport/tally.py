@@ -6,8 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, ColorSums, opaque_index
-from ..scene.lobes import Trail
-from ..scene.rays import Hit
+from ..scene.hit import Hit, Trail
 from .emit import Batch
 
 
