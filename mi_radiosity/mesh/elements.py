@@ -194,6 +194,7 @@ class Tree(Elements):
         arrays = (every, every, zero, zero, nought, nought, dr.full(mi.Float, 1, n), patches.area, patches.reflectance)
         super().__init__(patches, {name: type(array)(array) for name, array in zip(ARRAYS, arrays)})
         self._materials, self._lights, self.leaf_count = materials, lights, n
+        self._colored = n  # so many know their own ρ, the others that of their parent
         if lights.textured:
             self.exitance = mi.Color3f(patches.emission)
         crown = Crown(patches, labels) if labels else ()
@@ -216,7 +217,7 @@ class Tree(Elements):
             setattr(self, name, concat(getattr(self, name), new[name]))
         if self.exitance is not None:
             self.exitance = concat(self.exitance, dr.gather(mi.Color3f, self.exitance, first))
-        self.crown, self.leaf_count = crown, dr.width(crown.roots)
+        self.crown, self.leaf_count, self._colored = crown, dr.width(crown.roots), n + m
         dr.eval(*self._arrays().values())
 
     @property
@@ -225,6 +226,8 @@ class Tree(Elements):
 
     def freeze(self) -> Elements:
         """The elements as they are now; what the tree does later leaves them alone."""
+        if self._materials.textured:
+            self._color()
         arrays = {name: type(value)(value) for name, value in self._arrays().items()}
         exitance = None if self.exitance is None else mi.Color3f(self.exitance)
         return Elements(self.patches, arrays, exitance, self.crown)
@@ -264,9 +267,6 @@ class Tree(Elements):
         """Arrays of the children ``which`` of elements."""
         patch, place = dr.gather(mi.UInt32, self.patch, parent), dr.gather(mi.UInt32, self.place, parent)
         frame = child_frame(which, *(dr.gather(mi.Float, x, parent) for x in (self.u0, self.v0, self.scale)))
-        reflectance = dr.gather(mi.Color3f, self.reflectance, parent)
-        if self._materials.textured:
-            reflectance = self._mean_reflectance(patch, *frame)
         return {
             "patch": patch,
             "parent": parent,
@@ -276,8 +276,18 @@ class Tree(Elements):
             "v0": frame[1],
             "scale": frame[2],
             "area": dr.gather(mi.Float, self.area, parent) * 0.25,
-            "reflectance": reflectance,
+            "reflectance": dr.gather(mi.Color3f, self.reflectance, parent),
         }
+
+    def _color(self):
+        """Give new elements the ρ of their part of textures, all in one go."""
+        count = len(self) - self._colored
+        if count:
+            new = opaque_index(self._colored) + dr.arange(mi.UInt32, count)
+            frame = (dr.gather(type(x), x, new) for x in (self.patch, self.u0, self.v0, self.scale))
+            dr.scatter(self.reflectance, self._mean_reflectance(*frame), new)
+            dr.eval(self.reflectance)
+        self._colored = len(self)
 
     def _mean_reflectance(self, patch, u0, v0, scale):
         """ρ averaged over four points of each element (Color3f)."""

@@ -14,7 +14,7 @@ from ..core.errors import RadiosityError
 from ..core.plugins import Registry
 from ..core.points import kronecker, triangle
 from .faces import Faces
-from .state import parameters
+from .state import Parameters
 
 LIGHTS = Registry("emitter")
 LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
@@ -76,7 +76,7 @@ class Light:
 
     def fingerprint(self) -> bytes:
         """What tells it from other lamps: all parameters of the emitter."""
-        return parameters(self.emitter)
+        return bytes(Parameters(self.emitter))
 
     def density(self, direction: "mi.Vector3f") -> "mi.Float":
         """Density of `sample` over directions, 1/sr, if rays that leave the scene see the lamp; else 0 (Float [n])."""

@@ -17,7 +17,7 @@ from .overlap import find_overlaps
 from .patches import lift_of, make_patches
 from .rays import Rays
 from .reach import reached
-from .state import State, parameters
+from .state import Parameters, State
 
 
 class Model:
@@ -38,7 +38,7 @@ class Model:
         self.faces = Faces(scene)
         self.materials = Materials(self.faces)
         self.lights = Lights(self.faces, required=lit)
-        self._named = self._parameters()
+        self._named = self._parameters()  # as they are now
         overlaps = self._find_overlaps()
         self.unreached = 0
         if sides is None:
@@ -110,15 +110,17 @@ class Model:
         order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
-        digest.update(self._named)
+        for named in self._named:
+            digest.update(bytes(named))
         return digest.hexdigest()
 
     def _parameters(self):
-        """What there is to know by name of lamps that are no surfaces, and of lobes that are traced, as it is now."""
-        f, found = self.faces, [light.fingerprint() for light in self.lights.free]
+        """What there is to know by name of lamps that are no surfaces, and of lobes that are traced."""
+        f = self.faces
+        found: list[bytes | Parameters] = [light.fingerprint() for light in self.lights.free]
         ends = np.searchsorted(f.shape, np.arange(len(f.parts) + 1))
         first = np.array([f.rank[start:end].min(initial=len(f)) for start, end in pairwise(ends)])
         for number in np.argsort(first, kind="stable"):
             if self.materials.traced[number]:
-                found.append(str(first[number]).encode() + parameters(f.parts[number].shape.bsdf()))
-        return b"".join(found)
+                found += [str(first[number]).encode(), Parameters(f.parts[number].shape.bsdf())]
+        return found

@@ -38,13 +38,25 @@ def refuse_gradients(scene: "mi.Scene") -> None:
                 )
 
 
-def parameters(thing: "mi.Object") -> bytes:
-    """What tells a lamp or a material from others: its class, and all of its parameters that Mitsuba shows."""
-    found = [thing.class_name().encode()]
-    for name, value in sorted(mi.traverse(thing), key=lambda parameter: parameter[0]):
-        number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
-        found += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
-    return b"".join(found)
+class Parameters:
+    """What tells a lamp or a material from others, as it is now: its class, and all of its parameters that Mitsuba
+    shows. They are kept as Dr.Jit's variables, and only looked at when their bytes are asked for."""
+
+    def __init__(self, thing: "mi.Object") -> None:
+        self._kind = thing.class_name()
+        self._values = sorted(((name, _kept(value)) for name, value in mi.traverse(thing)), key=lambda item: item[0])
+
+    def __bytes__(self) -> bytes:
+        found = [self._kind.encode()]
+        for name, value in self._values:
+            number = dr.is_array_v(value) or isinstance(value, (bool, int, float))
+            found += [name.encode(), np.array(value if number else value.matrix, dtype=np.float32).tobytes()]
+        return b"".join(found)
+
+
+def _kept(value):
+    """A value that stays as it is: Mitsuba's own would change with the scene."""
+    return type(value)(value)
 
 
 def _parameters(scene):
@@ -52,7 +64,7 @@ def _parameters(scene):
     members = {part.shape.ptr: part.shape for part in parts(scene) if part.to_world is not None}
     things = [*scene.shapes(), *members.values(), *scene.emitters()]
     return {
-        (number, f"{thing.id() or number}.{name}"): type(value)(value)  # Mitsuba's own would change with the scene
+        (number, f"{thing.id() or number}.{name}"): _kept(value)
         for number, thing in enumerate(things)
         for name, value in mi.traverse(thing)
     }
