@@ -9,7 +9,7 @@ from ..core.points import ROUNDS, Stream, hash_pair, kronecker, stream_seed, tri
 from .lights import Lights
 from .rays import Rays
 
-GLANCES, PROBES = 4, 32  # rays per side that look for light: of all, and of those that found none
+GLANCES, PROBES = 2, 32  # rays per side that look for light: of all, and of those that found none
 FEW = 1 << 14  # sides: so many look with all their rays at once
 MOST_PROBES = 1 << 23  # rays of all sides together, where there are that many
 LAMP_PROBES = 1 << 16  # rays from all lamps together
@@ -29,7 +29,7 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
     lit = emits | _met_by_free(rays, lights)
     links = [_from_lamps(rays, np.flatnonzero(emits))] if emits.any() else []
     dark = np.arange(patches.count)
-    probes = max(2 * GLANCES, min(PROBES, MOST_PROBES // patches.count))
+    probes = max(4 * GLANCES, min(PROBES, MOST_PROBES // patches.count))
     glances = PROBES if patches.count <= FEW else GLANCES
     for first, last in ((0, glances), (glances, probes)):
         source, number = np.repeat(dark, last - first), np.tile(np.arange(first, last), len(dark))
