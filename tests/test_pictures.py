@@ -61,7 +61,7 @@ class Counted:
 
 
 @pytest.mark.parametrize("seconds", [0.5, 3, 10, 1000])
-def test_passes_double_and_fill_the_time(seconds, monkeypatch):
+def test_passes_grow_and_fill_the_time(seconds, monkeypatch):
     clock, told = Clock(), []
     monkeypatch.setattr(pixels, "time", clock)
     picture = Counted(clock)

@@ -11,6 +11,7 @@ from ..core.arrays import opaque_index
 from ..core.points import ROUNDS, Stream, permuted, stream_seed
 
 AT_ONCE = 1 << 23  # camera samples in one launch
+GROWTH = 4  # by which passes grow
 
 
 class PixelPoints:
@@ -96,25 +97,33 @@ class Growing(Protocol):
 
 
 def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, int], None]) -> int:
-    """Take samples until ``seconds`` are over, in passes that double as far as they fit; returns how many per pixel.
+    """Take samples until ``seconds`` are over, in passes that grow as far as they fit; returns how many per pixel.
 
     show(image, samples) is told after every pass; image() is the picture then. At least one sample is taken; what a
     pass takes is judged by those before.
     """
-    start, done, spp, number, speed = time.perf_counter(), 0, 1, 0, 0.0
+    passes: list[tuple[int, float]] = []
+    start, done, spp = time.perf_counter(), 0, 1
     while True:
         before = time.perf_counter()
-        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + number))
+        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + len(passes)))
         dr.sync_thread()
-        now = time.perf_counter()
-        done, number = done + spp, number + 1
+        passes.append((spp, time.perf_counter() - before))
+        done += spp
         show(picture.image, done)
-        left = seconds - (time.perf_counter() - start)
-        # The first passes compile, and have less to say of what the next ones take.
-        speed = (now - before) / spp if number < 3 else max((now - before) / spp, 0.9 * speed)
-        fits = int(0.95 * left / max(speed, 1e-9))
+        once, each = _costs(passes)
+        fits = int((0.95 * (seconds - (time.perf_counter() - start)) - once) / max(each, 1e-9))
         if fits < 1:
             return done
-        spp = min(2 * spp, fits) if number > 1 else 1
-        if fits < 2 * spp:  # rather one pass of all that fits than a small one at the end
+        spp = (GROWTH if len(passes) > 1 else 2) * spp
+        if fits < GROWTH * spp:  # rather one pass of all that fits than a small one at the end
             spp = fits
+
+
+def _costs(passes):
+    """What a pass takes whatever its size, and per sample, from (samples, seconds) of those before."""
+    (n, took), before = passes[-1], passes[1:-1]  # the first one compiles, and tells nothing
+    each = took / n
+    if before and n > before[-1][0]:
+        each = min(max((took - before[-1][1]) / (n - before[-1][0]), 0.5 * each), each)
+    return took - each * n, each

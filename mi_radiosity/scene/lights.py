@@ -359,6 +359,11 @@ class Lights:
         return dr.pi * seen * self.sky_light.color
 
     @property
+    def may_be_sharp(self) -> bool:
+        """Does a lamp that is no surface cast sharp shadows?"""
+        return any(light.may_be_sharp for light in self.free)
+
+    @property
     def sky_light(self) -> Light | None:
         """The lamp that rays see which leave the scene, or None."""
         return next((light for light in self.free if light.is_sky), None)

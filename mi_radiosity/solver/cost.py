@@ -25,21 +25,25 @@ FOLLOWED = 0.5  # of the rays go on through lobes; the others are lines
 # Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY, PER_LINK = 110e6, 2.5e3, 4e3, 24, 26
 # Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
-WORK, LINES = 2, 640
+WORK, LINES = 2, 320
+# Launches that follow rays, however few, and the seconds of all others.
+LAUNCHES, OTHERS = 32, 0.2
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read."""
+    """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read,
+    ``least`` of them however few rays and elements there are."""
 
     elements: int
     rays: int
     memory: float
     seconds: float
+    least: float
 
 
 def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
-    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two or three.
+    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two.
 
     Time is a multiple of what some rays take that are traced here and now, straight and through lobes.
     """
@@ -47,19 +51,25 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     count = leaves or model.patches.count
     rays = rays or default_rays(model, shared or count)
     more, cast = count - (top_of(shared) if shared else model.patches.count), model.rays
-    line = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
-    lobes = 0 if cast.lobes is None else max(_seconds(model, cast.follow) - line, 0)
+    line, once = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
+    lobes = 0.0
+    if cast.lobes:
+        both, once = _seconds(model, cast.follow)
+        lobes = max(both - line, 0)
+    traced = rays / (2 if model.lights.may_be_sharp else 1)  # the others are lines from where they end, and short
+    least = OTHERS + LAUNCHES * once
+    seconds = least + line * (WORK * traced + LINES * more) + lobes * FOLLOWED * traced
     memory = (
         PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE) + PER_LINK * rays
     )
-    return Cost(shared or count, rays, memory, line * (WORK * rays + LINES * more) + lobes * FOLLOWED * rays)
+    return Cost(shared or count, rays, memory, seconds, least)
 
 
 def default_rays(model: Model, elements: int) -> int:
     """The ray budget of so many leaf elements where none is given; twice as much where lamps cast sharp shadows, for
     which rays look from where they end."""
     rays = RAYS_PER_ELEMENT * min(elements, ELEMENTS) + LEAST_RAYS * elements
-    return rays * (2 if any(light.may_be_sharp for light in model.lights.free) else 1)
+    return rays * (2 if model.lights.may_be_sharp else 1)
 
 
 def plan(model: Model, elements: int | None, epsilon: float | None) -> tuple[int | None, int | None]:
@@ -93,7 +103,7 @@ def afford(
     Both go with the time, up to the default elements and MOST times the default rays.
     """
     usual = estimate_cost(model, elements, rays)
-    share = min(max(seconds / max(usual.seconds, 1e-9), FEWEST), MOST)
+    share = min(max((seconds - usual.least) / max(usual.seconds - usual.least, 1e-9), FEWEST), MOST)
     rays = rays or round(share * usual.rays)
     if elements is None and share < 1:
         elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
@@ -102,18 +112,25 @@ def afford(
 
 
 def _seconds(model, follow):
-    """What a ray takes."""
-    _trace(model, follow)  # once before, as kernels are compiled
-    start = time.perf_counter()
-    _trace(model, follow)
-    return (time.perf_counter() - start) / PROBES
+    """What a ray takes, and what a launch of them does whatever their number."""
+    few = PROBES // 8
+    _trace(model, follow, few)  # once before, as kernels are compiled
+    taken = []
+    for rays in (few, PROBES):
+        start = time.perf_counter()
+        _trace(model, follow, rays)
+        taken.append(time.perf_counter() - start)
+    ray = max(taken[1] - taken[0], 0) / (PROBES - few)
+    return ray, max(taken[0] - few * ray, 0)
 
 
-def _trace(model, follow):
+def _trace(model, follow, rays):
     """Trace cosine-distributed rays from all over the scene, neighbours after neighbours as a solve does."""
-    n = dr.arange(mi.UInt32, PROBES)
+    n = dr.arange(mi.UInt32, rays)
     u, v, s, t = kronecker(n, opaque_index(0), opaque_index(0))
-    patch = mi.UInt32((mi.UInt64(n // RUN * RUN) * mi.UInt64(opaque_index(model.patches.count))) // PROBES)
+    patch = mi.UInt32(
+        (mi.UInt64(n // RUN * RUN) * mi.UInt64(opaque_index(model.patches.count))) // mi.UInt64(opaque_index(rays))
+    )
     hit = follow(*model.rays.leave(patch, *triangle(u, v), s, t), n, opaque_index(0))
     dr.eval(hit.patch, hit.u)
     dr.sync_thread()

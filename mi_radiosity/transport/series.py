@@ -92,7 +92,7 @@ class _Series:
         n = dr.width(elements.leaves)
         self.direct, self.indirect, self.caustic = ([dr.zeros(mi.Float64, n) for _ in range(3)] for _ in range(3))
         self.traces = problem.model.rays.lobes is not None
-        self.focuses = self.traces and any(light.may_be_sharp for light in problem.model.lights.free)
+        self.focuses = self.traces and problem.model.lights.may_be_sharp
         self.share, self.left, self.shot, self.iteration = first_share, rays, 0.0, 0
         self.landings, self.all_landings = None, Landings(problem.exposure.slots)
         self.records: list[Record] = []
