@@ -23,7 +23,7 @@ class CleanPicture:
     """A picture [height, width, 3] of ``sample(scene, sampler, ray)`` that takes more and more samples, denoised.
 
     Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals
-    of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel. draw: passes(pixels, spp, seed),
+    of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel. draw: `passes`,
     where samples come from.
     """
 
@@ -38,7 +38,7 @@ class CleanPicture:
 
     def add(self, spp: int, seed: int) -> None:
         """Take ``spp`` more samples per pixel; another seed every time."""
-        for points in self._draw(self._width * self._height, spp, seed):
+        for points in self._draw(self._width * self._height, spp, seed, min(max(FEATURE_SPP - self._seen, 0), spp)):
             look = self._seen < FEATURE_SPP
             planes = _sums(self._scene, self._sensor, points, self._sample, look)
             self._color += planes[0]

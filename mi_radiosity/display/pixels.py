@@ -50,11 +50,20 @@ class PixelPoints:
         return mi.Point2f(mi.radical_inverse_2(index, x), mi.sobol_2(index, y))
 
 
-def passes(pixels: int, spp: int, seed: int) -> Iterator[PixelPoints]:
-    """``spp`` samples of each of so many pixels, in launches of AT_ONCE samples."""
-    most = max(1, AT_ONCE // pixels)
-    for first in range(0, spp, most):
-        yield PixelPoints(pixels, first, min(most, spp - first), spp, seed)
+def spans(pixels: int, spp: int, apart: int = 0) -> Iterator[tuple[int, int]]:
+    """``spp`` samples of each of so many pixels in launches of AT_ONCE samples, the first ``apart`` of them by
+    themselves: where each begins, and how many it takes."""
+    most, first = max(1, AT_ONCE // pixels), 0
+    while first < spp:
+        count = min(most, (apart if first < apart else spp) - first)
+        yield first, count
+        first += count
+
+
+def passes(pixels: int, spp: int, seed: int, apart: int = 0) -> Iterator[PixelPoints]:
+    """The same as points."""
+    for first, count in spans(pixels, spp, apart):
+        yield PixelPoints(pixels, first, count, spp, seed)
 
 
 class FilmPicture:

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..display import SHADERS, CleanPicture
+from ..display.pixels import spans
 from ..scene import Model
 from ..solver import SOLVING_SHARE, solve
 from . import require_extra
@@ -195,10 +196,10 @@ def _denoised_path(scene, sensor, spp):
     """A picture by `path`, denoised as ours are."""
     integrator = mi.load_dict({"type": "path", "max_depth": -1})
 
-    def draw(pixels, spp, seed):
-        for first in range(0, spp, most := max(1, (1 << 23) // pixels)):
+    def draw(pixels, spp, seed, apart):
+        for first, count in spans(pixels, spp, apart):
             sampler = mi.load_dict({"type": "independent"})
-            sampler.set_sample_count(count := min(most, spp - first))
+            sampler.set_sample_count(count)
             sampler.seed(seed + first, pixels * count)
             yield sampler
 

@@ -104,10 +104,11 @@ def afford(
     """
     usual = estimate_cost(model, elements, rays)
     share = min(max((seconds - usual.least) / max(usual.seconds - usual.least, 1e-9), FEWEST), MOST)
-    rays = rays or round(share * usual.rays)
+    given, rays = rays, rays or round(share * usual.rays)
     if elements is None and share < 1:
         elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
         elements = min(elements, max(rays // FEW_RAYS, ELEMENTS))
+        rays = given or max(rays, FEW_RAYS * elements)
     return elements, rays
 
 
