@@ -11,6 +11,7 @@ import numpy as np
 from ..core.arrays import NONE, ColorSums, lower_bound, opaque_index, owned, totals
 from ..core.points import Stream, cosine_direction, kronecker, lamp_lot, stream_seed, triangle
 from ..mesh.hierarchy import pull
+from ..scene.materials import WHITEST
 from .emit import launches
 from .gather import Gatherer, Places
 from .landings import Landings
@@ -112,28 +113,39 @@ class _Pass:
         landings = self._landings.settled().filled_by(flow.landings)
         links.look(self._gatherer.seeing(reflected, landings))
         direct, sharp = (self._means(sums) for sums in (self._direct, self._sharp))
-        indirect = self._bounced(links, glow, [d - s for d, s in zip(direct, sharp)], flow)
+        indirect = self._bounced(links, glow, direct, sharp, flow)
         light = dict(zip(("direct", "indirect"), self._scaled(flow, direct, indirect)))
         if self._sharp_lamps:
             light["sharp"] = pull(e, sharp, exposure.open_area)
         return dataclasses.replace(flow, **light, landings=landings, rays=flow.rays + self.rays, shot=flow)
 
-    def _bounced(self, links, glow, direct, flow):
-        """Indirect light as rays have found it, from leaf to leaf, beginning with what was shot; ``direct`` is what
-        they do not look for where they end (3 Float64 [leaves])."""
+    def _bounced(self, links, glow, direct, sharp, flow):
+        """Indirect light as rays have found it, from leaf to leaf, beginning with what was shot (3 Float64 [leaves]).
+        Sharp light is what they look for where they end."""
         e = self._problem.elements
         leaves, rows = e.leaves, dr.arange(mi.UInt32, len(self._lines))
-        rho = _of(e.reflectance, leaves)
-        direct = mi.Color3f(*map(mi.Float, direct))
-        seen = direct + (0 if flow.caustic is None else _of(flow.caustic, leaves))
-        shone, light = glow.gather(rows), _of(flow.indirect, leaves) + direct
-        for _ in range(BOUNCES):
+        rho, shone = _of(e.reflectance, leaves), glow.gather(rows)
+        direct, sharp = (mi.Color3f(*map(mi.Float, light)) for light in (direct, sharp))
+        seen = direct - sharp + (0 if flow.caustic is None else _of(flow.caustic, leaves))
+
+        def bounce(light):
+            """Indirect light that comes of light on the leaves (3 Float64 ─► 3 Float64 [leaves])."""
             reflected = dr.zeros(mi.Color3f, len(e))
             dr.scatter(reflected, rho * light, leaves)
             dr.eval(reflected)
             indirect = self._averaged([g + s / RAYS_PER_LINE for g, s in zip(shone, links.sums(reflected))])
+            dr.eval(indirect)
+            return indirect
+
+        # A ray that was shot into a white hollow stays there. What nobody who looks around has seen any light of is no
+        # brighter than all the rest, by all its bounces.
+        found = direct + mi.Color3f(*map(mi.Float, bounce(seen)))
+        most = dr.max(found, axis=None)[0] / flow.first_share + found / (1 - WHITEST)
+        light = direct - sharp + dr.minimum(_of(flow.indirect, leaves), most)
+        for _ in range(BOUNCES):
+            indirect = bounce(light)
             light = seen + mi.Color3f(*map(mi.Float, indirect))
-            dr.eval(indirect, light)
+            dr.eval(light)
         return indirect
 
     def _starts(self, each):
