@@ -140,8 +140,8 @@ class _Pass:
         # A ray that was shot into a white hollow stays there. What nobody who looks around has seen any light of is no
         # brighter than all the rest, by all its bounces.
         found = direct + mi.Color3f(*map(mi.Float, bounce(seen)))
-        most = dr.max(found, axis=None)[0] / flow.first_share + found / (1 - WHITEST)
-        light = direct - sharp + dr.minimum(_of(flow.indirect, leaves), most)
+        others = dr.opaque(mi.Float, dr.max(found, axis=None)[0] / flow.first_share)
+        light = direct - sharp + dr.minimum(_of(flow.indirect, leaves), others + found / (1 - WHITEST))
         for _ in range(BOUNCES):
             indirect = bounce(light)
             light = seen + mi.Color3f(*map(mi.Float, indirect))
