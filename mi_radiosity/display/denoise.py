@@ -23,8 +23,8 @@ class CleanPicture:
     """A picture [height, width, 3] of ``sample(scene, sampler, ray)`` that takes more and more samples, denoised.
 
     Samples are averaged pixel by pixel, as the denoiser needs pixels that are independent, with albedo and normals
-    of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel. draw: `passes`,
-    where samples come from.
+    of the surfaces seen; the film's own filter is applied afterwards, pixel to pixel. draw: `passes`, or
+    another source of samples.
     """
 
     def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, draw: Callable = passes) -> None:

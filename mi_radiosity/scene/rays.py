@@ -73,7 +73,7 @@ class Rays:
         hit = self.trace(origin, direction, active)
         if self.lobes is None:
             return hit
-        # Few go on: packed side by side, they do not keep the others waiting.
+        # Those that go on do so side by side, and do not keep the others waiting.
         every = dr.zeros(mi.UInt32, dr.width(direction))
         states = [mi.Point3f(origin + every), direction, number + every, seed + every]
         dr.eval(states, hit)

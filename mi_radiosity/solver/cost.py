@@ -100,10 +100,12 @@ def afford(
 ) -> tuple[int | None, int]:
     """Elements and rays, where they are not given, that a solve of about so many seconds has; None for the default.
 
-    Both go with the time, up to the default elements and MOST times the default rays.
+    Both go with the time, up to the default elements and MOST times the default rays. Of the seconds that pass whatever
+    there is to do, these are charged with half: with all of them nothing would be left where time is short.
     """
     usual = estimate_cost(model, elements, rays)
-    share = min(max((seconds - usual.least) / max(usual.seconds - usual.least, 1e-9), FEWEST), MOST)
+    least = 0.5 * usual.least
+    share = min(max((seconds - least) / max(usual.seconds - least, 1e-9), FEWEST), MOST)
     given, rays = rays, rays or round(share * usual.rays)
     if elements is None and share < 1:
         elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
