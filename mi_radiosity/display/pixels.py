@@ -111,27 +111,27 @@ def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, 
     show(image, samples) is told after every pass; image() is the picture then. At least one sample is taken; what a
     pass takes is judged by those before.
     """
-    passes: list[tuple[int, float]] = []
+    taken: list[tuple[int, float]] = []  # samples and seconds of passes
     start, done, spp = time.perf_counter(), 0, 1
     while True:
         before = time.perf_counter()
-        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + len(passes)))
+        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + len(taken)))
         dr.sync_thread()
-        passes.append((spp, time.perf_counter() - before))
+        taken.append((spp, time.perf_counter() - before))
         done += spp
         show(picture.image, done)
-        once, each = _costs(passes)
+        once, each = _costs(taken)
         fits = int((0.95 * (seconds - (time.perf_counter() - start)) - once) / max(each, 1e-9))
         if fits < 1:
             return done
-        spp = (GROWTH if len(passes) > 1 else 2) * spp
+        spp = (GROWTH if len(taken) > 1 else 2) * spp
         if fits < GROWTH * spp:  # rather one pass of all that fits than a small one at the end
             spp = fits
 
 
-def _costs(passes):
+def _costs(taken):
     """What a pass takes whatever its size, and per sample, from (samples, seconds) of those before."""
-    (n, took), before = passes[-1], passes[1:-1]  # the first one compiles, and tells nothing
+    (n, took), before = taken[-1], taken[1:-1]  # the first one compiles, and tells nothing
     each = took / n
     if before and n > before[-1][0]:
         each = min(max((took - before[-1][1]) / (n - before[-1][0]), 0.5 * each), each)

@@ -73,14 +73,17 @@ def _table(sides, values, n):
 def _boxes(under, over):
     """Boxes around triangles ``over``, in the barycentric coordinates of triangles ``under`` (both [n, 3, 3]): two
     corners [n, 2]."""
-    e1, e2 = (under[:, k] - under[:, 0] for k in (1, 2))
-    normal = np.cross(e1, e2)
-    n2 = (normal**2).sum(axis=1)[:, None]
-    x = over - under[:, :1]
-    u = (np.cross(x, e2[:, None]) * normal[:, None]).sum(axis=2) / n2
-    v = (np.cross(e1[:, None], x) * normal[:, None]).sum(axis=2) / n2
+    u, v = barycentric(over, under)
     low, high = (np.column_stack([which(u, axis=1), which(v, axis=1)]) for which in (np.min, np.max))
     return low - PAD * (1 + high - low), high + PAD * (1 + high - low)
+
+
+def barycentric(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (u, v) of ``points`` [n, m, 3] in the planes of triangles [n, 3, 3] (two [n, m])."""
+    e1, e2 = (triangles[:, k, None] - triangles[:, :1] for k in (1, 2))
+    x, normal = points - triangles[:, :1], np.cross(e1, e2)
+    n2 = (normal**2).sum(axis=2)
+    return (np.cross(x, e2) * normal).sum(axis=2) / n2, (np.cross(e1, x) * normal).sum(axis=2) / n2
 
 
 def _in_cells(low, high, finest):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..core.arrays import components, opaque_index, owned
 from .faces import Faces
-from .lookup import EDGE, Lookup
+from .lookup import EDGE, Lookup, barycentric
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 CORNERS = 8  # of a box
@@ -311,8 +311,5 @@ def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _inside(points, triangles):
     """Do ``points`` [n, m, 3] lie in the triangles [n, 3, 3] of their planes (bool [n, m])?"""
-    e1, e2 = (triangles[:, k, None] - triangles[:, :1] for k in (1, 2))
-    x, normal = points - triangles[:, :1], np.cross(e1, e2)
-    n2 = (normal**2).sum(axis=2)
-    a, b = (np.cross(x, e2) * normal).sum(axis=2) / n2, (np.cross(e1, x) * normal).sum(axis=2) / n2
+    a, b = barycentric(points, triangles)
     return (a >= -EDGE) & (b >= -EDGE) & (a + b <= 1 + EDGE)

@@ -145,7 +145,6 @@ class _Pass:
         for _ in range(BOUNCES):
             indirect = bounce(light)
             light = seen + mi.Color3f(*map(mi.Float, indirect))
-            dr.eval(light)
         return indirect
 
     def _starts(self, each):
