@@ -46,29 +46,35 @@ class Clock:
 
 
 class Counted:
-    """A picture that counts."""
+    """A picture that counts, ``step`` samples at a time, and takes a while to finish."""
 
-    def __init__(self, clock, each=1.0):
-        self.clock, self.each, self.passes, self.seeds = clock, each, [], []
+    def __init__(self, clock, step=1, last=0.0):
+        self.clock, self.step, self.last, self.passes, self.seeds = clock, step, last, [], []
 
     def add(self, spp, seed):
-        self.clock.now += self.each * spp
+        self.clock.now += spp
         self.passes.append(spp)
         self.seeds.append(seed)
 
-    def image(self):
+    def preview(self):
         return sum(self.passes)
 
+    def finishing(self, seconds):
+        return self.last
 
+
+@pytest.mark.parametrize("step, last", [(1, 0.0), (4, 0.0), (1, 7.0), (4, 7.0)])
 @pytest.mark.parametrize("seconds", [0.5, 3, 10, 1000])
-def test_passes_grow_and_fill_the_time(seconds, monkeypatch):
+def test_passes_grow_and_fill_the_time(seconds, step, last, monkeypatch):
+    """In whole steps, and leave what the last image takes."""
     clock, told = Clock(), []
     monkeypatch.setattr(pixels, "time", clock)
-    picture = Counted(clock)
+    picture = Counted(clock, step, last)
     done = pixels.grow(picture, 0, seconds, lambda image, samples: told.append((image(), samples)))
     assert done == sum(picture.passes) == told[-1][1] and all(image == samples for image, samples in told)
-    assert len(set(picture.seeds)) == len(picture.seeds)
-    assert done == 1 if seconds < 1 else 0.85 * seconds - 1 <= done <= seconds
+    assert len(set(picture.seeds)) == len(picture.seeds) and all(spp % step == 0 for spp in picture.passes)
+    left = seconds - last
+    assert done == step if left < step else 0.85 * left - step <= done <= max(left, step)
     assert len(picture.passes) < 20
 
 
@@ -138,21 +144,61 @@ def test_an_interrupt_keeps_the_best_so_far(tmp_path, capsys, monkeypatch):
 # ---- Denoised --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("parts", [1, 2, 3])
 @pytest.mark.parametrize("name", ["gaussian", "tent", "mitchell", "box"])
-def test_a_filter_over_pixels_is_as_wide_as_the_film_s(name):
-    """Variances add up: that of the weights and of the pixel itself is that of the filter."""
+def test_a_filter_over_parts_of_pixels_is_as_wide_as_the_film_s(name, parts):
+    """Variances add up: that of the weights and of a part itself is that of the filter, or of a pixel if it is less."""
     rfilter = mi.load_dict({"type": name})
-    reach = int(np.ceil(rfilter.radius() - 0.5))
-    if reach < 1:
-        image = np.random.default_rng(0).random((4, 4, 3))
-        assert denoise._filtered(image, rfilter) is image  # a pixel is all there is of it
-        return
-    weight = denoise._over_pixels(rfilter, reach)
-    x = np.linspace(-reach - 0.5, reach + 0.5, 2001)
+    weight = denoise._over_parts(rfilter, parts)
+    x = np.linspace(-rfilter.radius(), rfilter.radius(), 20001)
     curve = np.array([float(rfilter.eval(float(y))[0]) for y in x])
-    wide = (curve @ x**2) / curve.sum()
-    assert weight.sum() == pytest.approx(1)
-    assert weight @ np.arange(-reach, reach + 1) ** 2 + 1 / 12 == pytest.approx(max(wide, 1 / 12), rel=0.03, abs=1e-3)
+    wide = 1 / 12 if name == "box" else (curve @ x**2) / curve.sum()
+    place = (np.arange(len(weight)) - (len(weight) - 1) / 2) / parts
+    assert weight.sum() == pytest.approx(1) and weight == pytest.approx(weight[::-1])
+    assert weight @ place**2 + 1 / (12 * parts**2) == pytest.approx(max(wide, 1 / 12), rel=0.03, abs=1e-3)
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_filtered_parts_are_pixels_in_their_place(parts):
+    """A ramp stays one away from the border, whatever the filter; and of a box a pixel is the mean of its parts."""
+    wide, high = 12, 9
+    across = (np.arange(wide * parts) + 0.5) / parts
+    ramp = np.repeat(np.broadcast_to(across, (high * parts, wide * parts))[..., None], 3, axis=2).astype(np.float32)
+    for name in ("gaussian", "tent", "mitchell", "box"):
+        image = denoise._filtered(ramp, mi.load_dict({"type": name}), parts)
+        assert image.shape == (high, wide, 3) and image.dtype == np.float32
+        assert image[:, 3:-3] == pytest.approx(np.broadcast_to(np.arange(3, wide - 3)[:, None] + 0.5, (high, 6, 3)))
+    image = np.random.default_rng(0).random((high * parts, wide * parts, 3)).astype(np.float32)
+    mean = image.reshape(high, parts, wide, parts, 3).mean(axis=(1, 3))
+    assert denoise._filtered(image, mi.load_dict({"type": "box"}), parts) == pytest.approx(mean)
+
+
+def test_denoising_parts_of_pixels_keeps_edges(box, solution):
+    """Beside `path` under the film's own filter the picture is better than if whole pixels were denoised; and what it
+    is made of is as much as was asked for, in whole steps."""
+    pytest.importorskip("mitsuba_oidn")
+    true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(8)], axis=0)[..., :3]
+    integrator = mi.load_dict({"type": "radiosity"})
+    integrator.show(solution, "gather")
+    picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample)
+    picture.add(62, seed=1)
+    assert picture._color * picture.step == 64 and picture._looks * picture.step == denoise.FEATURE_SPP
+
+    def error(image):
+        return np.sqrt(np.mean((np.clip(image, 0, 1) - np.clip(true, 0, 1)) ** 2))
+
+    assert error(picture.image()) < 0.8 * error(picture.preview())
+
+
+def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
+    """The better, the more time there is; parts of pixels of enough samples only; and the last image has its time."""
+    pytest.importorskip("mitsuba_oidn")
+    picture = denoise.CleanPicture(box, box.sensors()[0], None)
+    monkeypatch.setattr(denoise.CleanPicture, "_pace", 1 / picture._pixels)  # the cheapest way takes a second
+    ways = [picture._way(cost / denoise.DENOISING_SHARE) for _, _, cost in denoise.WAYS]
+    assert ways == list(denoise.WAYS) and picture._way(0) == denoise.WAYS[0] and picture._way(None) == denoise.WAYS[-1]
+    assert picture._way(None, spp=denoise.LEAST_FINE - 4)[0] == 1
+    assert picture.finishing(1000) == denoise.WAYS[-1][2] and picture.finishing(0) == 1
 
 
 # ---- Rough metal -----------------------------------------------------------------------------------

@@ -102,11 +102,19 @@ class ColorSums:
         self._to_float = [dr.opaque(mi.Float64, u) for u in self.unit]
         self._sums = [dr.zeros(mi.Int64, bins) for _ in range(3)]
 
-    def add(self, color: "Sequence[dr.ArrayBase]", index: "mi.UInt32", active: "mi.Bool | bool" = True) -> None:
-        """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n])."""
+    def add(
+        self,
+        color: "Sequence[dr.ArrayBase]",
+        index: "mi.UInt32",
+        active: "mi.Bool | bool" = True,
+        sorted: bool = False,
+    ) -> None:
+        """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n]); where it is ``sorted``,
+        neighbours are added up before they meet memory."""
         # Dr.Jit's own choice, Expand, has the number of bins in the kernel.
+        mode = dr.ReduceMode.Local if sorted else dr.ReduceMode.Direct
         for sums, scale, value in zip(self._sums, self._to_fixed, color):
-            dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active, mode=dr.ReduceMode.Direct)
+            dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active, mode=mode)
 
     def gather(self, index: "mi.UInt32") -> "list[mi.Float64]":
         """The sums of bins ``index`` as three Float64 [n]."""

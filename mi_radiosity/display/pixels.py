@@ -70,6 +70,8 @@ class FilmPicture:
     """A picture on the film of a sensor that takes more and more camera samples of
     ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
 
+    step = 1
+
     def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable) -> None:
         self._scene, self._sensor, self._sample, self._film = scene, sensor, sample, sensor.film()
         self._film.prepare([])
@@ -92,36 +94,49 @@ class FilmPicture:
             self._film.put_block(block)
             dr.eval(block.tensor())
 
-    def image(self) -> "mi.TensorXf":
+    def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What the film holds now [height, width, channels]."""
         return self._film.develop()
 
+    preview = image
+
+    def finishing(self, seconds: float) -> float:
+        return 0.0
+
 
 class Growing(Protocol):
-    """A FilmPicture, or one that is denoised."""
+    """A FilmPicture, or one that is denoised: takes samples in multiples of ``step``; ``image`` is as good as it gets
+    where so many seconds are all there are, of which it takes ``finishing``; ``preview`` takes little."""
+
+    step: int
 
     def add(self, spp: int, seed: int) -> None: ...
 
-    def image(self) -> "mi.TensorXf": ...
+    def image(self, seconds: float | None = None) -> "mi.TensorXf": ...
+
+    def preview(self) -> "mi.TensorXf": ...
+
+    def finishing(self, seconds: float) -> float: ...
 
 
 def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, int], None]) -> int:
     """Take samples until ``seconds`` are over, in passes that grow as far as they fit; returns how many per pixel.
 
-    show(image, samples) is told after every pass; image() is the picture then. At least one sample is taken; what a
-    pass takes is judged by those before.
+    show(image, samples) is told after every pass; image() is the picture then. At least one step of samples is taken;
+    what a pass takes is judged by those before.
     """
     taken: list[tuple[int, float]] = []  # samples and seconds of passes
-    start, done, spp = time.perf_counter(), 0, 1
+    start, done, spp = time.perf_counter(), 0, picture.step
     while True:
         before = time.perf_counter()
         picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + len(taken)))
         dr.sync_thread()
         taken.append((spp, time.perf_counter() - before))
         done += spp
-        show(picture.image, done)
+        show(picture.preview, done)
         once, each = _costs(taken)
-        fits = int((0.95 * (seconds - (time.perf_counter() - start)) - once) / max(each, 1e-9))
+        left = seconds - (time.perf_counter() - start) - picture.finishing(seconds)
+        fits = int((0.95 * left - once) / max(each, 1e-9)) // picture.step * picture.step
         if fits < 1:
             return done
         spp = (GROWTH if len(taken) > 1 else 2) * spp

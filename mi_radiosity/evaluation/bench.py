@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..display import SHADERS, CleanPicture
+from ..display.denoise import DENOISING_SHARE
 from ..display.pixels import spans
 from ..scene import Model
 from ..solver import SOLVING_SHARE, solve
@@ -204,9 +205,10 @@ def _denoised_path(scene, sensor, spp):
             sampler.seed(seed + first, pixels * count)
             yield sampler
 
+    start = now()
     picture = CleanPicture(scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), draw)
     picture.add(spp, seed=spp)
-    return np.array(picture.image())
+    return np.array(picture.image((now() - start) / (1 - DENOISING_SHARE)))
 
 
 def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:

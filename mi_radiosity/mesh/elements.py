@@ -12,7 +12,7 @@ from ..scene.lights import Lights
 from ..scene.materials import Materials
 from ..scene.patches import Patches
 from .crown import Crown
-from .subdivision import child_at, child_frame
+from .subdivision import child_at, child_frame, child_point
 
 MAX_LEVEL = 14  # below it float32 barycentric coordinates get too coarse; 4 + 2 · 14 bits are a place
 ARRAYS = ("patch", "parent", "child", "place", "u0", "v0", "scale", "area", "reflectance")
@@ -173,8 +173,11 @@ class Elements:
         """The leaf below ``element`` that holds the patch point (u, v) (UInt32 [n])."""
         element = mi.UInt32(element)
         child = dr.gather(mi.UInt32, self.child, element, active)
+        a, b = self.own_point(element, u, v, active)
         while child != 0:
-            element = child + self.locate(element, u, v)
+            which = child_at(a, b)
+            a, b = child_point(which, a, b)
+            element = child + which
             child = dr.gather(mi.UInt32, self.child, element)
         return element
 
