@@ -59,7 +59,7 @@ class Counted:
     def preview(self):
         return sum(self.passes)
 
-    def finishing(self, seconds):
+    def finishing(self, seconds, spp):
         return self.last
 
 
@@ -195,10 +195,11 @@ def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     pytest.importorskip("mitsuba_oidn")
     picture = denoise.CleanPicture(box, box.sensors()[0], None)
     monkeypatch.setattr(denoise.CleanPicture, "_pace", 1 / picture._pixels)  # the cheapest way takes a second
-    ways = [picture._way(cost / denoise.DENOISING_SHARE) for _, _, cost in denoise.WAYS]
-    assert ways == list(denoise.WAYS) and picture._way(0) == denoise.WAYS[0] and picture._way(None) == denoise.WAYS[-1]
-    assert picture._way(None, spp=denoise.LEAST_FINE - 4)[0] == 1
-    assert picture.finishing(1000) == denoise.WAYS[-1][2] and picture.finishing(0) == 1
+    least, *_, best = denoise.WAYS
+    assert picture._way(0, 64) == least and picture._way(best[2] / best[3], 64) == picture._way(None, 64) == best
+    assert all(way[2] <= way[3] * seconds for seconds in range(1, 30) for way in [picture._way(seconds, 64)])
+    assert picture._way(None, denoise.LEAST_FINE - 1)[0] == 1
+    assert picture.finishing(1000, 64) == best[2] and picture.finishing(0, 64) == least[2]
 
 
 # ---- Rough metal -----------------------------------------------------------------------------------

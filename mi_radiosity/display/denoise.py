@@ -16,9 +16,9 @@ from .pixels import passes
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
-DENOISING_SHARE = 0.3  # of the time that denoising may take, where there is a limit
-# Ways to denoise, better and better: parts of a pixel, quality, and how long they take beside the first.
-WAYS = ((1, "Balanced", 1.0), (1, "High", 2.0), (FINE, "Balanced", 2.8), (FINE, "High", 6.0))
+# Ways to denoise, better and better: parts of a pixel, quality, how long it takes beside the first, and the share of
+# the time that it may take, where there is a limit.
+WAYS = ((1, "Balanced", 1.0, 1.0), (1, "High", 2.0, 0.3), (FINE, "Balanced", 2.8, 0.6), (FINE, "High", 6.0, 0.3))
 
 
 def require_denoiser() -> Any:
@@ -58,8 +58,8 @@ class CleanPicture:
             self._looks += points.sample_count() if look else 0
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
-        """What has been sampled, without its noise; as well as a share of ``seconds`` allows, if given."""
-        parts, quality, cost = self._way(seconds, self._color * self.step)
+        """What has been sampled, without its noise; as well as its share of ``seconds`` allows, if given."""
+        parts, quality, cost, _ = self._way(seconds, self._color * self.step)
         start, counts = time.perf_counter(), np.array([self._color, self._looks, self._looks], np.float32)
         planes = self._sums / counts.reshape(3, 1, 1, 1)
         if parts == 1:
@@ -75,18 +75,18 @@ class CleanPicture:
         """The same in little time."""
         return self.image(0)
 
-    def finishing(self, seconds: float) -> float:
-        """How many of so many seconds the last `image` takes, as far as that is known."""
-        return self._way(seconds)[2] * self._pixels * self._pace
+    def finishing(self, seconds: float, spp: int) -> float:
+        """How many of so many seconds the last `image` takes of so many samples, as far as that is known."""
+        return self._way(seconds, spp)[2] * self._pixels * self._pace
 
     @property
     def _pixels(self):
         return self._sums[0, ..., 0].size / FINE**2
 
-    def _way(self, seconds, spp=LEAST_FINE):
-        """The best way to denoise ``spp`` samples per pixel, of those that take no more than a share of seconds."""
-        most = np.inf if seconds is None else DENOISING_SHARE * seconds / (self._pixels * self._pace)
-        ways = [way for way in WAYS if way[2] <= most and (way[0] == 1 or spp >= LEAST_FINE)]
+    def _way(self, seconds, spp):
+        """The best way to denoise ``spp`` samples per pixel, of those that take no more than their share of seconds."""
+        most = np.inf if seconds is None else seconds / (self._pixels * self._pace)
+        ways = [w for w in WAYS if w[2] <= w[3] * most and (w[0] == 1 or spp >= LEAST_FINE)]
         return (ways or WAYS[:1])[-1]
 
 

@@ -100,7 +100,8 @@ class FilmPicture:
 
     preview = image
 
-    def finishing(self, seconds: float) -> float:
+    def finishing(self, seconds: float, spp: int) -> float:
+        """How many of so many seconds `image` takes of so many samples."""
         return 0.0
 
 
@@ -116,7 +117,7 @@ class Growing(Protocol):
 
     def preview(self) -> "mi.TensorXf": ...
 
-    def finishing(self, seconds: float) -> float: ...
+    def finishing(self, seconds: float, spp: int) -> float: ...
 
 
 def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, int], None]) -> int:
@@ -135,8 +136,9 @@ def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, 
         done += spp
         show(picture.preview, done)
         once, each = _costs(taken)
-        left = seconds - (time.perf_counter() - start) - picture.finishing(seconds)
-        fits = int((0.95 * left - once) / max(each, 1e-9)) // picture.step * picture.step
+        left = 0.95 * (seconds - (time.perf_counter() - start)) - once
+        left -= picture.finishing(seconds, done + int(max(left, 0) / max(each, 1e-9)))
+        fits = int(left / max(each, 1e-9)) // picture.step * picture.step
         if fits < 1:
             return done
         spp = (GROWTH if len(taken) > 1 else 2) * spp
