@@ -208,14 +208,14 @@ class Solution:
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         shading: ``gather`` and ``direct`` gather light at every pixel, ``gouraud`` and ``flat`` show what was solved.
-        denoise: remove the noise of the samples by Open Image Denoise (extra ``denoise``); the picture has 3 channels.
+        denoise: remove the noise of the samples by Open Image Denoise (extra ``denoise``); the picture has 3 channels, and
+        samples are taken in fours.
         seconds: take as many samples as fit, instead of ``spp``; show(image, samples) is told after
         every pass, image() being the picture then.
         Raises RadiosityError if the scene has been edited since it was solved.
         """
         if seconds is not None and not 0 < seconds < float("inf"):
             raise RadiosityError(f"seconds must be a number greater than 0, not {seconds}")
-        self.require_unchanged()
         integrator = mi.load_dict({"type": "radiosity"})
         integrator.show(self, shading)
         return integrator.picture(self.model.scene, sensor, seed, spp, denoise, seconds, show)
