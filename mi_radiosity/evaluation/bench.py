@@ -74,8 +74,8 @@ def run_bench(
 
     Ours is reading, solve and pictures, with kernels warm: for a ladder of budgets, or, in a shading that samples, of
     times, denoised and not. ``path`` runs at 1…1024 samples per pixel; Open Image Denoise, where it is installed, gets
-    box-filtered pixels or quarters of them, albedo and normals of both, and the film's filter comes afterwards. The camera
-    path turns the first sensor about its place, at half the resolution and with a quarter of the samples at most.
+    box-filtered pixels or quarters of them, albedo and normals of both, and the film's filter comes afterwards. The
+    camera path turns the first sensor about its place, at half the resolution and a quarter of the samples.
     """
     require_extra()
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
