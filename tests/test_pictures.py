@@ -194,12 +194,13 @@ def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     """The better, the more time there is; parts of pixels of enough samples only; and the last image has its time."""
     pytest.importorskip("mitsuba_oidn")
     picture = denoise.CleanPicture(box, box.sensors()[0], None)
-    monkeypatch.setattr(denoise.CleanPicture, "_pace", 1 / picture._pixels)  # the cheapest way takes a second
     least, *_, best = denoise.WAYS
-    assert picture._way(0, 64) == least and picture._way(best[2] / best[3], 64) == picture._way(None, 64) == best
-    assert all(way[2] <= way[3] * seconds for seconds in range(1, 30) for way in [picture._way(seconds, 64)])
-    assert picture._way(None, denoise.LEAST_FINE - 1)[0] == 1
-    assert picture.finishing(1000, 64) == best[2] and picture.finishing(0, 64) == least[2]
+    monkeypatch.setattr(denoise.CleanPicture, "_pace", 1e-6 / picture._takes(least))  # the cheapest takes a second
+    planned = [picture.finishing(seconds, 64) for seconds in range(30)]
+    assert planned == sorted(planned) and planned[0] == pytest.approx(1) and planned[-1] == pytest.approx(best[2])
+    assert all(planned[seconds] <= max(0.6 * seconds, 1.001) for seconds in range(30))
+    coarse = max(way[2] for way in denoise.WAYS if way[0] == 1)
+    assert picture.finishing(1000, denoise.LEAST_FINE - 1) == pytest.approx(coarse)
 
 
 # ---- Rough metal -----------------------------------------------------------------------------------

@@ -17,8 +17,9 @@ FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
 # Ways to denoise, better and better: parts of a pixel, quality, how long it takes beside the first, and the share of
-# the time that it may take, where there is a limit.
+# the time that it is planned with, where there is a limit; and how much longer the last image may take than is left.
 WAYS = ((1, "Balanced", 1.0, 1.0), (1, "High", 2.0, 0.3), (FINE, "Balanced", 2.8, 0.6), (FINE, "High", 6.0, 0.3))
+LATE = 1.3
 
 
 def require_denoiser() -> Any:
@@ -58,8 +59,9 @@ class CleanPicture:
             self._looks += points.sample_count() if look else 0
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
-        """What has been sampled, without its noise; as well as its share of ``seconds`` allows, if given."""
-        parts, quality, cost, _ = self._way(seconds, self._color * self.step)
+        """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
+        most = np.inf if seconds is None else LATE * seconds
+        parts, quality, cost, _ = self._way(self._color * self.step, lambda way: self._takes(way) <= most)
         start, counts = time.perf_counter(), np.array([self._color, self._looks, self._looks], np.float32)
         planes = self._sums / counts.reshape(3, 1, 1, 1)
         if parts == 1:
@@ -68,7 +70,7 @@ class CleanPicture:
         how = {"hdr": True, "clean_aux": True, "quality": getattr(self._denoiser.Quality, quality)}
         clean = self._denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, **how)
         image = mi.TensorXf(_filtered(np.asarray(clean), self._rfilter, parts))
-        CleanPicture._pace = (time.perf_counter() - start) / (cost * self._pixels)
+        CleanPicture._pace *= (time.perf_counter() - start) / self._takes((parts, quality, cost))
         return image
 
     def preview(self) -> "mi.TensorXf":
@@ -77,16 +79,15 @@ class CleanPicture:
 
     def finishing(self, seconds: float, spp: int) -> float:
         """How many of so many seconds the last `image` takes of so many samples, as far as that is known."""
-        return self._way(seconds, spp)[2] * self._pixels * self._pace
+        return self._takes(self._way(spp, lambda way: self._takes(way) <= way[3] * seconds))
 
-    @property
-    def _pixels(self):
-        return self._sums[0, ..., 0].size / FINE**2
+    def _takes(self, way):
+        """Seconds that a way takes, by what the last one did."""
+        return way[2] * self._pace * self._sums[0, ..., 0].size / FINE**2
 
-    def _way(self, seconds, spp):
-        """The best way to denoise ``spp`` samples per pixel, of those that take no more than their share of seconds."""
-        most = np.inf if seconds is None else seconds / (self._pixels * self._pace)
-        ways = [w for w in WAYS if w[2] <= w[3] * most and (w[0] == 1 or spp >= LEAST_FINE)]
+    def _way(self, spp, allowed):
+        """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
+        ways = [way for way in WAYS if allowed(way) and (way[0] == 1 or spp >= LEAST_FINE)]
         return (ways or WAYS[:1])[-1]
 
 

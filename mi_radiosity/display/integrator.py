@@ -84,8 +84,8 @@ def _integrator_class():
             if seconds is None:
                 picture.add(spp, seed)
             else:
+                grow(picture, seed, seconds - (time.perf_counter() - start), show or (lambda image, samples: None))
                 seconds -= time.perf_counter() - start
-                grow(picture, seed, seconds, show or (lambda image, samples: None))
             return picture.image(seconds)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):

@@ -101,13 +101,13 @@ class FilmPicture:
     preview = image
 
     def finishing(self, seconds: float, spp: int) -> float:
-        """How many of so many seconds `image` takes of so many samples."""
+        """How many of so many seconds `image` should take of so many samples."""
         return 0.0
 
 
 class Growing(Protocol):
     """A FilmPicture, or one that is denoised: takes samples in multiples of ``step``; ``image`` is as good as it gets
-    where so many seconds are all there are, of which it takes ``finishing``; ``preview`` takes little."""
+    in so many seconds, and ``preview`` takes little; ``finishing`` is what an image should take of all seconds."""
 
     step: int
 
@@ -137,8 +137,10 @@ def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, 
         show(picture.preview, done)
         once, each = _costs(taken)
         left = 0.95 * (seconds - (time.perf_counter() - start)) - once
-        left -= picture.finishing(seconds, done + int(max(left, 0) / max(each, 1e-9)))
-        fits = int(left / max(each, 1e-9)) // picture.step * picture.step
+        fits = left / max(each, 1e-9)
+        for _ in range(2):  # what the image takes depends on how many samples there will be
+            fits = (left - picture.finishing(seconds, done + int(max(fits, 0)))) / max(each, 1e-9)
+        fits = int(fits) // picture.step * picture.step
         if fits < 1:
             return done
         spp = (GROWTH if len(taken) > 1 else 2) * spp

@@ -208,7 +208,7 @@ def _denoised_path(scene, sensor, spp):
     start = now()
     picture = CleanPicture(scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), draw)
     picture.add(spp, seed=spp)
-    return np.array(picture.image(ROOM * (now() - start)))
+    return np.array(picture.image(picture.finishing(ROOM * (now() - start), spp)))
 
 
 def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
