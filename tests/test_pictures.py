@@ -195,7 +195,7 @@ def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     pytest.importorskip("mitsuba_oidn")
     picture = denoise.CleanPicture(box, box.sensors()[0], None)
     least, *_, best = denoise.WAYS
-    monkeypatch.setattr(denoise.CleanPicture, "_pace", 1e-6 / picture._takes(least))  # the cheapest takes a second
+    monkeypatch.setattr(denoise.CleanPicture, "_pace", picture._pace / picture._takes(least))  # the cheapest: 1 s
     planned = [picture.finishing(seconds, 64) for seconds in range(30)]
     assert planned == sorted(planned) and planned[0] == pytest.approx(1) and planned[-1] == pytest.approx(best[2])
     assert all(planned[seconds] <= max(0.6 * seconds, 1.001) for seconds in range(30))
