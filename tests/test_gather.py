@@ -223,6 +223,7 @@ def test_denoised_pictures_are_closer(solution, reference):
     assert rmse(clean, reference) < 0.7 * rmse(plain, reference)
     walls = reference.max(axis=2) < 1
     assert clean[walls].mean() == pytest.approx(reference[walls].mean(), rel=0.01)
+    assert clean.mean() == pytest.approx(reference.mean(), rel=0.02)
 
 
 def test_a_white_hollow_is_no_brighter_than_what_shines_into_it():

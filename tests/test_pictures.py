@@ -182,7 +182,7 @@ def test_denoising_parts_of_pixels_keeps_edges(box, solution):
     integrator.show(solution, "gather")
     picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample)
     picture.add(62, seed=1)
-    assert picture._color * picture.step == 64 and picture._looks * picture.step == denoise.FEATURE_SPP
+    assert picture._count * picture.step == 64 and picture._seen * picture.step == denoise.FEATURE_SPP
 
     def error(image):
         return np.sqrt(np.mean((np.clip(image, 0, 1) - np.clip(true, 0, 1)) ** 2))
@@ -197,9 +197,9 @@ def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     least, *_, best = denoise.WAYS
     monkeypatch.setattr(denoise.CleanPicture, "_pace", picture._pace / picture._takes(least))  # the cheapest: 1 s
     planned = [picture.finishing(seconds, 64) for seconds in range(30)]
-    assert planned == sorted(planned) and planned[0] == pytest.approx(1) and planned[-1] == pytest.approx(best[2])
+    assert planned == sorted(planned) and planned[0] == pytest.approx(1) and planned[-1] == pytest.approx(best.cost)
     assert all(planned[seconds] <= max(0.6 * seconds, 1.001) for seconds in range(30))
-    coarse = max(way[2] for way in denoise.WAYS if way[0] == 1)
+    coarse = max(way.cost for way in denoise.WAYS if way.parts == 1)
     assert picture.finishing(1000, denoise.LEAST_FINE - 1) == pytest.approx(coarse)
 
 

@@ -107,12 +107,12 @@ class ColorSums:
         color: "Sequence[dr.ArrayBase]",
         index: "mi.UInt32",
         active: "mi.Bool | bool" = True,
-        sorted: bool = False,
+        runs: bool = False,
     ) -> None:
-        """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n]); where it is ``sorted``,
-        neighbours are added up before they meet memory."""
+        """Add ``color`` (three Float or Float64 [n]) to bins ``index`` (UInt32 [n]); where these come in
+        ``runs`` of the same bin, neighbours are added up before they meet memory."""
         # Dr.Jit's own choice, Expand, has the number of bins in the kernel.
-        mode = dr.ReduceMode.Local if sorted else dr.ReduceMode.Direct
+        mode = dr.ReduceMode.Local if runs else dr.ReduceMode.Direct
         for sums, scale, value in zip(self._sums, self._to_fixed, color):
             dr.scatter_add(sums, mi.Int64(mi.Float64(value) * scale), index, active, mode=mode)
 

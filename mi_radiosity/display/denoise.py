@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -16,10 +16,25 @@ from .pixels import passes
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
-# Ways to denoise, better and better: parts of a pixel, quality, how long it takes beside the first, and the share of
-# the time that it is planned with, where there is a limit; and how much longer the last image may take than is left.
-WAYS = ((1, "Balanced", 1.0, 1.0), (1, "High", 2.0, 0.3), (FINE, "Balanced", 2.8, 0.6), (FINE, "High", 6.0, 0.3))
-LATE = 1.3
+LATE = 1.3  # times what is left of the time, which the last image may take
+
+
+class Way(NamedTuple):
+    """A way to denoise: what, how well, how long it takes beside the cheapest, and the share of all time, where that is
+    limited, up to which it is planned."""
+
+    parts: int  # of a pixel along each side
+    quality: str
+    cost: float
+    share: float
+
+
+WAYS = (  # better and better
+    Way(1, "Balanced", 1.0, 1.0),
+    Way(1, "High", 2.0, 0.3),
+    Way(FINE, "Balanced", 2.8, 0.6),
+    Way(FINE, "High", 6.0, 0.3),
+)
 
 
 def require_denoiser() -> Any:
@@ -45,32 +60,32 @@ class CleanPicture:
         self._draw, self._rfilter = draw, sensor.film().rfilter()
         width, height = self._sensor.film().crop_size()
         # Sums of radiance, albedo and normals; and of how many samples of each part.
-        self._sums, self._color, self._looks = np.zeros((3, height, width, 3), np.float32), 0, 0
+        self._sums, self._count, self._seen = np.zeros((3, height, width, 3), np.float32), 0, 0
 
     def add(self, spp: int, seed: int) -> None:
         """Take ``spp`` more samples per pixel, rounded up to a multiple of ``step``; another seed every time."""
         each, enough = -(-spp // self.step), FEATURE_SPP // self.step
         pixels = self._sums[0, ..., 0].size
-        for points in self._draw(pixels, each, seed, min(max(enough - self._looks, 0), each)):
-            look = self._looks < enough
+        for points in self._draw(pixels, each, seed, min(max(enough - self._seen, 0), each)):
+            look = self._seen < enough
             planes = _plane_sums(self._scene, self._sensor, points, self._sample, look)
             self._sums[: len(planes)] += planes.reshape(-1, *self._sums.shape[1:])
-            self._color += points.sample_count()
-            self._looks += points.sample_count() if look else 0
+            self._count += points.sample_count()
+            self._seen += points.sample_count() if look else 0
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
         most = np.inf if seconds is None else LATE * seconds
-        parts, quality, cost, _ = self._way(self._color * self.step, lambda way: self._takes(way) <= most)
-        start, counts = time.perf_counter(), np.array([self._color, self._looks, self._looks], np.float32)
+        way = self._way(self._count * self.step, lambda way: self._takes(way) <= most)
+        start, counts = time.perf_counter(), np.array([self._count, self._seen, self._seen], np.float32)
         planes = self._sums / counts.reshape(3, 1, 1, 1)
-        if parts == 1:
+        if way.parts == 1:
             planes = np.mean([planes[:, i::FINE, j::FINE] for i in range(FINE) for j in range(FINE)], axis=0)
         color, albedo, normal = planes
-        how = {"hdr": True, "clean_aux": True, "quality": getattr(self._denoiser.Quality, quality)}
+        how = {"hdr": True, "clean_aux": True, "quality": getattr(self._denoiser.Quality, way.quality)}
         clean = self._denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, **how)
-        image = mi.TensorXf(_filtered(np.asarray(clean), self._rfilter, parts))
-        CleanPicture._pace *= (time.perf_counter() - start) / self._takes((parts, quality, cost))
+        image = mi.TensorXf(_filtered(np.asarray(clean), self._rfilter, way.parts))
+        CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
         return image
 
     def preview(self) -> "mi.TensorXf":
@@ -79,15 +94,15 @@ class CleanPicture:
 
     def finishing(self, seconds: float, spp: int) -> float:
         """How many of so many seconds the last `image` takes of so many samples, as far as that is known."""
-        return self._takes(self._way(spp, lambda way: self._takes(way) <= way[3] * seconds))
+        return self._takes(self._way(spp, lambda way: self._takes(way) <= way.share * seconds))
 
     def _takes(self, way):
         """Seconds that a way takes, by what the last one did."""
-        return way[2] * self._pace * self._sums[0, ..., 0].size / FINE**2
+        return way.cost * self._pace * self._sums[0, ..., 0].size / FINE**2
 
     def _way(self, spp, allowed):
         """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
-        ways = [way for way in WAYS if allowed(way) and (way[0] == 1 or spp >= LEAST_FINE)]
+        ways = [way for way in WAYS if allowed(way) and (way.parts == 1 or spp >= LEAST_FINE)]
         return (ways or WAYS[:1])[-1]
 
 

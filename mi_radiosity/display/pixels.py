@@ -136,10 +136,10 @@ def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, 
         done += spp
         show(picture.preview, done)
         once, each = _costs(taken)
-        left = 0.95 * (seconds - (time.perf_counter() - start)) - once
-        fits = left / max(each, 1e-9)
+        left, each = 0.95 * (seconds - (time.perf_counter() - start)) - once, max(each, 1e-9)
+        fits = left / each
         for _ in range(2):  # what the image takes depends on how many samples there will be
-            fits = (left - picture.finishing(seconds, done + int(max(fits, 0)))) / max(each, 1e-9)
+            fits = (left - picture.finishing(seconds, done + int(max(fits, 0)))) / each
         fits = int(fits) // picture.step * picture.step
         if fits < 1:
             return done

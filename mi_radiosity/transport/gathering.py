@@ -242,10 +242,10 @@ class _Pass:
             sharp = dr.select(self._gatherer.is_sharp_sky(direction), met.sky / RAYS_PER_LINE, 0)
             found = shone + self._gatherer.reflected_by(met)
         if line or self._gatherer.glows:
-            other.add(found if line else shone, row, on_top, sorted=True)
-        self._direct.add(lamps, row, on_top, sorted=True)
+            other.add(found if line else shone, row, on_top, runs=True)
+        self._direct.add(lamps, row, on_top, runs=True)
         if self._sharp_lamps:
-            self._sharp.add(sharp, row, on_top, sorted=True)
+            self._sharp.add(sharp, row, on_top, runs=True)
         light = dr.sum(lamps + found)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
         if problem.exposure.slots:

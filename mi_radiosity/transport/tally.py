@@ -27,8 +27,8 @@ class Tally:
         if isinstance(hit, Trail):
             every = dr.zeros(mi.UInt32, dr.width(receiver))
             taken = [p * mi.Float64(t) for p, t in zip(power, hit.taken)]
-            self.sums.add(power, every + self._bin(self.SENT), active, sorted=True)
-            self.sums.add(taken, every + self._bin(self.TAKEN), active, sorted=True)
+            self.sums.add(power, every + self._bin(self.SENT), active, runs=True)
+            self.sums.add(taken, every + self._bin(self.TAKEN), active, runs=True)
             power = [p * mi.Float64(w) for p, w in zip(power, hit.weight)]
         self.sums.add(power, dr.select(hit.patch != NONE, receiver, lost), active)
 
