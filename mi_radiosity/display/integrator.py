@@ -115,7 +115,9 @@ def _integrator_class():
             else:
                 number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
                 lamps = solution.gatherer.highlights
-                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active, highlights=lamps)
+                # The first lobe, and a line to a lamp from there, are as well spread as the ray is.
+                first = sampler.next_1d(), *sampler.next_2d(), *sampler.next_2d(), sampler.next_1d()
+                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active, highlights=lamps, first=first)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)

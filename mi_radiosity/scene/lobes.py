@@ -1,5 +1,6 @@
 """Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -26,12 +27,14 @@ class Lobes:
         mode: "mi.TransportMode",
         camera: bool,
         highlights: Any = None,
+        first: "Sequence[mi.Float]" = (),
     ) -> Trail:
         """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
 
         mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.
         camera: the first surface's own light counts, too. highlights: how rough lobes see lamps; without, only by
-        their own rays.
+        their own rays. first: uniform numbers that the first lobe is drawn with, three, and then its lines (Float [n]);
+        those of well spread rays are well spread, too.
         """
         ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
@@ -39,17 +42,18 @@ class Lobes:
         start = Trail.straight(Hit(no, dr.full(mi.UInt32, NONE, n), nought, nought, no, no), ray.d)
 
         def step(alive, ray, pdf, depth, random, trail):
-            return self._step(rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail)
+            chance = _Chance(random, depth == 0, first)
+            return self._step(rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, chance, trail)
 
         state = (~no, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
         return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
 
-    def _step(self, rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, random, trail):
+    def _step(self, rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, chance, trail):
         """One more hit, of rays drawn with densities ``pdf`` where lines look for lamps as well, else 0."""
         prelim = rays.scene.ray_intersect_preliminary(ray, active=alive)
         hit, before = rays.locate(prelim, ray.d), trail.weight
         si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, hit.traced)
-        s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        s, st = chance.next_float32(), mi.Point2f(chance.next_float32(), chance.next_float32())
         bsdf = si.bsdf(ray)
         sample, value = bsdf.sample(ctx, si, s, st, hit.traced)
         parts = mi.Float(0), mi.Float(0)
@@ -70,7 +74,7 @@ class Lobes:
         shines = hit.traced & on_patch & (trail.bounced | camera)
         glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
         if highlights is not None:
-            glow += before * highlights.light(gloss, parts[0], bsdf, si, random, hit.traced & (parts[0] > 0))
+            glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, hit.traced & (parts[0] > 0))
         rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
         factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that meets them as received, the others nothing.
@@ -78,7 +82,7 @@ class Lobes:
 
         depth += 1
         lives = dr.select(on & (depth > ROULETTE), dr.minimum(dr.max(before * factor), 0.95), 1)
-        goes_on = on & (dr.max(before * factor) > 0) & (random.next_float32() < lives) & (depth < MOST)
+        goes_on = on & (dr.max(before * factor) > 0) & (chance.random.next_float32() < lives) & (depth < MOST)
         weight = dr.select(on & ~goes_on, 0, before * factor / dr.maximum(lives, 1e-6))
         trail = Trail(
             valid=hit.valid,
@@ -96,4 +100,15 @@ class Lobes:
             rough=dr.select(trail.bounced, trail.rough, rough & ~smooth),
         )
         ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
-        return goes_on, ray, pdf, depth, random, trail
+        return goes_on, ray, pdf, depth, chance.random, trail
+
+
+class _Chance:
+    """Uniform numbers: of a generator, but for the first few of those who have some ``given``."""
+
+    def __init__(self, random: "mi.PCG32", has: "mi.Bool", given: "Sequence[mi.Float]") -> None:
+        self.random, self._has, self._given = random, has, list(given)
+
+    def next_float32(self) -> "mi.Float":
+        number = self.random.next_float32()
+        return dr.select(self._has, self._given.pop(0), number) if self._given else number

@@ -1,5 +1,6 @@
 """Rays between patches: where they end, what they miss, and the kernel F along them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -64,26 +65,27 @@ class Rays:
         camera: bool = False,
         active: "mi.Bool | bool" = True,
         highlights: Any = None,
+        first: "Sequence[mi.Float]" = (),
     ) -> Hit | Trail:
         """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
 
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
-        camera: they look for light, and the first surface's own counts. highlights: see `Lobes.follow`.
+        camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`.
         """
         hit = self.trace(origin, direction, active)
         if self.lobes is None:
             return hit
         # Those that go on do so side by side, and do not keep the others waiting.
         every = dr.zeros(mi.UInt32, dr.width(direction))
-        states = [mi.Point3f(origin + every), direction, number + every, seed + every]
+        states = [mi.Point3f(origin + every), direction, number + every, seed + every, *first]
         dr.eval(states, hit)
         on = dr.compress(hit.traced)
         end = Trail.straight(hit, direction)
         if dr.width(on) == 0:
             return end
-        origin, direction, number, seed = (dr.gather(type(x), x, on) for x in states)
+        origin, direction, number, seed, *first = (dr.gather(type(x), x, on) for x in states)
         mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
-        followed = self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, highlights)
+        followed = self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, highlights, first)
         dr.eval(followed)
         row = dr.full(mi.UInt32, NONE, dr.width(every))
         dr.scatter(row, dr.arange(mi.UInt32, dr.width(on)), on)

@@ -69,8 +69,8 @@ class Highlights:
         whole, own = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n)
         candidates = min(CANDIDATES, self._lamps.count)
         for _ in range(candidates):
-            lamp, density = self._lamps.draw(random.next_float32())
             u, v = triangle(random.next_float32(), random.next_float32())
+            lamp, density = self._lamps.draw(random.next_float32())
             d = patches.point(lamp, u, v) + patches.origin - si.p
             r2 = dr.squared_norm(d)
             cosine = dr.maximum(-dr.dot(dr.gather(mi.Vector3f, patches.normal, lamp, active), d), 0)
