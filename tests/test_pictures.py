@@ -5,6 +5,7 @@ import re
 import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.display import denoise, pixels
+from mi_radiosity.display.image import write_image
 from mi_radiosity.scene import Model
 from mi_radiosity.scene.lobes import Lobes
 from mi_radiosity.solver import cost
@@ -203,6 +204,13 @@ def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     assert all(planned[seconds] <= max(0.6 * seconds, 1.001) for seconds in range(30))
     coarse = max(way.cost for way in denoise.WAYS if way.parts == 1)
     assert picture.finishing(1000, denoise.LEAST_FINE - 1) == pytest.approx(coarse)
+
+
+def test_what_is_brighter_than_white_is_white_in_a_png(tmp_path):
+    """However bright: a small lamp has a radiance of many thousands."""
+    write_image(tmp_path / "bright.png", mi.TensorXf(np.float32([[[0, 0.5, 1], [2, 3e3, 1e6]]])))
+    (dark, half, white), *bright = np.array(mi.Bitmap(str(tmp_path / "bright.png"))).reshape(2, 3).tolist()
+    assert dark == 0 and half in (187, 188) and white == 255 and bright == [[255, 255, 255]]
 
 
 # ---- Rough metal -----------------------------------------------------------------------------------

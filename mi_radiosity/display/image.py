@@ -17,7 +17,8 @@ def write_image(path: str | os.PathLike[str], image: "mi.TensorXf", stats: dict 
         raise RadiosityError(f"{path} would hold values that are not numbers: the film or the scene has NaN")
     bitmap = mi.Bitmap(image)
     if str(path).lower().endswith(".png"):
-        bitmap = mi.util.convert_to_bitmap(image)
+        # Brighter than white is white: Mitsuba makes values of some 3,000 and more black.
+        bitmap = mi.util.convert_to_bitmap(mi.TensorXf(np.clip(np.array(image), 0, 1)))
     elif stats:
         bitmap.metadata()["mi_radiosity"] = json.dumps(stats)
     with writing(path) as temporary:
