@@ -3,7 +3,7 @@
 from fractions import Fraction
 
 from mi_radiosity.scene.lookup import EDGE, Lookup
-from mi_radiosity.scene.overlap import coplanar_pairs
+from mi_radiosity.scene.overlap import coplanar_pairs, surfaces
 
 import drjit as dr
 import mitsuba as mi
@@ -142,3 +142,16 @@ def test_owners_of_points_under_many_faces():
     clear = (~there | (np.abs(nearest + EDGE) > 1e-4)).all(axis=1)  # rounding may decide at edges
     assert clear.mean() > 0.5 and (owner[clear] > 1).mean() > 0.2
     assert (np.array(face)[clear] == owner[clear]).all() and not np.array(back).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_surfaces_do_not_depend_on_the_order_of_faces(seed):
+    """Two sheets in one plane and a wall meet in one edge, as where the hands of a clock lie on its face."""
+    points = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [-1, 0, 0], [2, 0, 0], [-2, 0, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 4, 1], [0, 1, 5], [0, 6, 1], [0, 1, 7]])
+    faces = np.random.default_rng(seed).permutation(faces)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a).astype(np.float64)
+    label = surfaces(faces, normal / np.linalg.norm(normal, axis=1)[:, None])
+    wall = (faces >= 6).any(axis=1)
+    assert len(set(label[wall])) == len(set(label[~wall])) == 1 and label[wall][0] != label[~wall][0]

@@ -20,9 +20,9 @@ class Faces:
     ``tracing``: the scene itself, or one in which every shape is a mesh; ``parts``: what its shapes stand for. Arrays
     over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
     ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
-    corners) and ``rank`` (its place in an order that only geometry decides); ``centre`` [3] of the
-    scene; ``smooth``: some shapes have vertex normals; ``vertex`` [faces, 3]: numbers of their corners, the same where
-    positions are the same to the bit.
+    corners), ``rank`` (its place in an order that only geometry decides) and ``order`` (the faces in it); ``centre``
+    [3] of the scene; ``smooth``: some shapes have vertex normals; ``vertex`` [faces, 3]: numbers of their corners, the
+    same where positions are the same to the bit.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -47,11 +47,13 @@ class Faces:
         self.refuse(~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh")
         self.corners = corners
         self.centre = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
-        self.rank = _canonical_rank(corners)
+        self.order = _canonical_order(corners)
+        self.rank = np.empty_like(self.order)
+        self.rank[self.order] = np.arange(len(corners))
         self.e1, self.e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         cross = np.cross(self.e1, self.e2)
         double_area = np.linalg.norm(cross, axis=1)
-        longest = np.maximum.reduce([(e**2).sum(axis=1) for e in (self.e1, self.e2, self.e2 - self.e1)])
+        longest = np.maximum.reduce([np.einsum("ij,ij->i", e, e) for e in (self.e1, self.e2, self.e2 - self.e1)])
         self.degenerate = double_area <= FLATNESS * longest
         if self.degenerate.any():
             count, where = int(self.degenerate.sum()), self.names(self.degenerate)
@@ -117,13 +119,13 @@ def _corners(scene):
     return np.concatenate(corners), np.array(counts)
 
 
-def _canonical_rank(corners):
-    """Place of every face in an order that only geometry decides (int [faces]).
+def _canonical_order(corners):
+    """Faces in an order that only geometry decides (int [faces]).
 
     Mitsuba's order of shapes varies from one process to the next. Along a Morton curve, so that
     neighbours in the order are neighbours in space; the bytes of the corners decide between equals.
     """
-    centroid = corners.mean(axis=1)
+    centroid = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3
     low = centroid.min(axis=0)
     # Off the borders of cells, where halves and thirds lie: rounding must not decide there.
     place = (centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (3**0.5 - 1) + 1 - 3**0.5 / 2
@@ -134,6 +136,4 @@ def _canonical_rank(corners):
             morton |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     words = np.ascontiguousarray(corners, dtype=np.float32).reshape(len(corners), 9).view(np.uint32).astype(np.uint64)
     odd = np.uint64(0x9E3779B97F4A7C15) * (2 * np.arange(9, dtype=np.uint64) + np.uint64(1))
-    rank = np.empty(len(corners), dtype=np.int64)
-    rank[np.lexsort(((words * odd).sum(axis=1), morton))] = np.arange(len(corners))
-    return rank
+    return np.lexsort(((words * odd).sum(axis=1), morton))

@@ -144,6 +144,7 @@ class Free(Light):
         super().__init__(emitter, scene, low, high)
         number = dr.arange(mi.UInt32, SAMPLES)
         weight = self.shoot(*kronecker(number, opaque_index(0), opaque_index(0)))[2]
+        dr.eval(weight)  # in one go: sums one by one would draw all again
         self._power = [total / SAMPLES for total in totals([mi.Float64(w) for w in weight])]
 
     def power(self) -> Sequence[float]:

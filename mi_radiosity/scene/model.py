@@ -41,18 +41,19 @@ class Model:
         self._named = self._parameters()  # as they are now
         overlaps = self._find_overlaps()
         self.unreached = 0
-        if sides is None:
-            sides = self._sides(self._candidate & ~overlaps.covered)
-            if lit and len(sides):
-                found = reached(self._rays(sides, overlaps), self.lights)
-                sides, self.unreached = sides[found], int((~found).sum())
-            if not len(sides):
-                raise RadiosityError(
-                    "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
-                )
-        kept, doubled = overlaps.among(self._numbers(sides))
-        self.rays = self._rays(sides, kept)
-        self.patches = self.rays.patches
+        patches = self._patches(self._sides(self._candidate & ~overlaps.covered) if sides is None else sides)
+        if sides is None and lit and patches.count:
+            found = reached(self._rays(patches, overlaps), self.lights)
+            self.unreached = int((~found).sum())
+            if self.unreached:
+                patches = self._patches(patches.sides[found])
+        if not patches.count:
+            raise RadiosityError(
+                "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
+            )
+        self.patches = patches
+        kept, doubled = overlaps.among(self._numbers(patches.sides))
+        self.rays = self._rays(patches, kept)
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
     def with_sides(self, sides: np.ndarray) -> "Model":
@@ -83,8 +84,10 @@ class Model:
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, lift_of(f)
         )
 
-    def _rays(self, sides, overlaps):
-        patches = make_patches(self.faces, self.materials, self.lights, sides)
+    def _patches(self, sides):
+        return make_patches(self.faces, self.materials, self.lights, sides)
+
+    def _rays(self, patches, overlaps):
         return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
 
     def _sides(self, which):
@@ -94,7 +97,7 @@ class Model:
 
     def _numbers(self, sides):
         """2 · face + (1 for the back) of sides."""
-        return 2 * np.argsort(self.faces.rank)[sides // 2] + sides % 2
+        return 2 * self.faces.order[sides // 2] + sides % 2
 
     def _warn_of(self, doubled):
         if not len(doubled):
@@ -107,7 +110,7 @@ class Model:
     @cached_property
     def fingerprint(self) -> str:
         digest, f = hashlib.sha256(), self.faces
-        order, rho = np.argsort(f.rank), np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
+        order, rho = f.order, np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
         for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
         for named in self._named:

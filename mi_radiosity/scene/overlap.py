@@ -61,7 +61,7 @@ def find_overlaps(
     ``tolerance``: how far from a plane still counts as in it, m.
     """
     f, g = coplanar_pairs(faces.corners, faces.normal, faces.area, ~faces.degenerate, tolerance)
-    order = _precedence(faces, present, exitance, reflectance)
+    order = _precedence(faces, np.unique(f), present, exitance, reflectance)
     opposite = (faces.normal[f] * faces.normal[g]).sum(axis=1) < 0
     under = np.concatenate([2 * f, 2 * f + 1])
     over = np.concatenate([2 * g + opposite, 2 * g + 1 - opposite])
@@ -72,16 +72,21 @@ def find_overlaps(
     return Overlaps(faces.corners, present.ravel(), under, over, _covered(faces.corners, under, over, present.shape))
 
 
-def _precedence(faces, present, exitance, reflectance):
-    """Place of every side in the order in which points belong to sides (int [2 · faces])."""
+def _precedence(faces, chosen, present, exitance, reflectance):
+    """Place of every side in the order in which points belong to sides, of the ``chosen`` faces (int [2 · faces])."""
+    order = np.zeros(present.size, dtype=np.int64)
+    if len(chosen) == 0:
+        return order
     surface = surfaces(faces.vertex, faces.normal)
-    size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface]
+    size = np.bincount(surface, weights=np.where(faces.degenerate, 0, faces.area))[surface[chosen]]
     first = np.full(surface.max() + 1, len(faces))
     np.minimum.at(first, surface, faces.rank)
     size = np.round(np.log(size + 1e-300), 4)
-    keys = (faces.rank[:, None], first[surface][:, None], reflectance, size[:, None], -exitance, ~present)
-    order = np.empty(present.size, dtype=np.int64)
-    order[np.lexsort([np.broadcast_to(k, present.shape).ravel() for k in keys])] = np.arange(present.size)
+    rank, first = faces.rank[chosen, None], first[surface[chosen], None]
+    keys = (rank, first, reflectance[chosen], size[:, None], -exitance[chosen], ~present[chosen])
+    sides = (2 * chosen[:, None] + [0, 1]).ravel()
+    places = np.lexsort([np.broadcast_to(k, (len(chosen), 2)).ravel() for k in keys])
+    order[sides[places]] = np.arange(len(sides))
     return order
 
 
@@ -122,18 +127,19 @@ class _Triangles:
         self._corners = [[owned(mi.Float64, corners[:, k, axis] - origin[axis]) for axis in range(3)] for k in range(3)]
         self._normal = [owned(mi.Float64, normal[:, axis]) for axis in range(3)]
         self._area, self._tolerance = owned(mi.Float64, area), dr.opaque(mi.Float64, tolerance)
+        self._twice = dr.opaque(mi.Float, 2 * tolerance)  # within which nothing is lost in float32
         first = corners[:, 0] - origin
-        self._first = owned(mi.Float64, np.column_stack([first, area]).ravel())
-        self._plane = owned(mi.Float64, np.column_stack([normal, -(normal * first).sum(axis=1)]).ravel())
+        self._first = owned(mi.Float, np.column_stack([first, area]).ravel())
+        self._plane = owned(mi.Float, np.column_stack([normal, -(normal * first).sum(axis=1)]).ravel())
 
-    def look(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "tuple[mi.Vector4d, mi.Vector4d]":
+    def look(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "tuple[mi.Vector4f, mi.Vector4f]":
         """A corner and the area of faces, and their planes."""
-        return tuple(dr.gather(mi.Vector4d, x, face, active) for x in (self._first, self._plane))
+        return tuple(dr.gather(mi.Vector4f, x, face, active) for x in (self._first, self._plane))
 
     def near_plane(self, one: "tuple[mi.Vector4d, mi.Vector4d]", other: "tuple[mi.Vector4d, mi.Vector4d]") -> "mi.Bool":
-        """Is a corner of the smaller face near the plane of the larger one (Bool [n])? Most pairs end here."""
+        """May a corner of the smaller face be near the plane of the larger one (Bool [n])? Most pairs end here."""
         heights = [n.x * p.x + n.y * p.y + n.z * p.z + n.w for (p, _), (_, n) in ((other, one), (one, other))]
-        return dr.abs(dr.select(one[0].w >= other[0].w, *heights)) <= self._tolerance
+        return dr.abs(dr.select(one[0].w >= other[0].w, *heights)) <= self._twice
 
     def boxes_meet(self, f: "mi.UInt32", g: "mi.UInt32", active: "mi.Bool") -> "mi.Bool":
         """Do the boxes of faces meet, not only at an edge (Bool [n])?"""
@@ -202,8 +208,8 @@ class _Grid:
         found, faces = [], []
         face = dr.arange(mi.UInt32, len(own))
         for corner in range(CORNERS):
-            cell, there = self._cell(face, self._first, mi.UInt32(corner))
-            rows = dr.compress(there)
+            cell, corners = self._cell(face, self._first, mi.UInt32(corner))
+            rows = dr.compress((corner & ~corners) == 0)
             found.append(np.array(dr.gather(mi.UInt32, self._key(cell, self._first), rows)))
             faces.append(np.array(rows))
         keys = np.concatenate(found)
@@ -230,27 +236,30 @@ class _Grid:
             mi.UInt32(self._first),
             opaque_index(dr.width(f)),
         )
-        step, own = CORNERS * self._first, self._triangles.look(face)
-        while step < CORNERS * self._grids:
-            grid = step // CORNERS
-            cell, there = self._cell(face, grid, step % CORNERS)
-            key = self._key(cell, grid)
-            place = dr.gather(mi.UInt32, self._start, key, there)
-            end = dr.gather(mi.UInt32, self._start, key + 1, there)
-            while place < end:
+        grid, corner, own = mi.UInt32(self._first), mi.UInt32(0), self._triangles.look(face)  # where to look next
+        here, x, y, z, place, end = (mi.UInt32(0) for _ in range(6))
+        # No loop in the loop: faces with little in their cells would wait for those with much.
+        while (place < end) | (grid < self._grids):
+            if place >= end:
+                here = mi.UInt32(grid)
+                (x, y, z), corners = self._cell(face, here, corner)
+                key = self._key((x, y, z), here)
+                place, end = (dr.gather(mi.UInt32, self._start, k) for k in (key, key + 1))
+                corner = (corner - corners) & corners  # after the last one it is the first again
+                grid += dr.select(corner == 0, mi.UInt32(1), 0)
+            if place < end:
                 other = dr.gather(mi.UInt32, self._there, place)
                 # Of two in one grid one looks at the other.
-                wanted = (dr.gather(mi.UInt32, self._first, other) == grid) & ((grid > first) | (other < face))
+                wanted = (dr.gather(mi.UInt32, self._first, other) == here) & ((here > first) | (other < face))
                 wanted &= self._triangles.near_plane(own, self._triangles.look(other, wanted))
                 if wanted:
-                    near = self._triangles.boxes_meet(face, other, self._counts_here(face, other, grid, cell))
+                    near = self._triangles.boxes_meet(face, other, self._counts_here(face, other, here, (x, y, z)))
                     at = dr.scatter_inc(count, mi.UInt32(0), near)
                     near &= at < room
                     dr.scatter(f, face, at, near)
                     dr.scatter(g, other, at, near)
                 place += 1
-            step += 1
-        return step
+        return grid
 
     def _counts_here(self, face, other, grid, cell):
         """Does the box that two faces share begin in this cell of several that both are in (Bool [n])?"""
@@ -260,15 +269,14 @@ class _Grid:
         return here
 
     def _cell(self, face, grid, corner):
-        """The cell of a grid that a corner of the boxes of faces lies in, and has it another cell than the corners
-        before it (three UInt32, Bool [n])?"""
-        scale, cell, there = dr.gather(mi.Float64, self._scale, grid), [], mi.Bool(True)
+        """The cell of a grid that a corner of the boxes of faces lies in (three UInt32 [n]); and which corners lie in
+        cells of their own (UInt32 [n]): those whose bits are among these."""
+        scale, cell, corners = dr.gather(mi.Float64, self._scale, grid), [], mi.UInt32(0)
         for axis, (low, high) in enumerate(zip(self._triangles.low, self._triangles.high)):
             a, b = (mi.UInt32(dr.gather(mi.Float64, x, face) * scale) for x in (low, high))
-            upper = (corner & (1 << axis)) != 0
-            there &= ~upper | (a != b)
-            cell.append(dr.select(upper, b, a))
-        return cell, there
+            corners |= dr.select(a != b, mi.UInt32(1 << axis), 0)
+            cell.append(dr.select((corner & (1 << axis)) != 0, b, a))
+        return cell, corners
 
     def _key(self, cell, grid):
         """A number below that of keys, from the cell of a grid (UInt32 [n])."""
@@ -297,16 +305,20 @@ def _covered(corners, under, over, shape):
 def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """A number per face, the same for faces of one plane that share edges and run along them in opposite directions;
     from the numbers of their corners [faces, 3] (int [faces])."""
-    n = len(vertex)
-    tail, head, face = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel(), np.repeat(np.arange(n), 3)
-    along, against = tail << 32 | head, head << 32 | tail
-    order = np.argsort(along, kind="stable")
-    at = np.minimum(np.searchsorted(along[order], against), 3 * n - 1)
-    joined = along[order][at] == against
-    f, g = face[joined], face[order[at[joined]]]
-    level = (normal[f] * normal[g]).sum(axis=1) > 1 - 1e-6
-    f, g = f[level], g[level]
-    return components(n, f, g)
+    tail, head = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel()
+    edge = np.minimum(tail, head) << 32 | np.maximum(tail, head) << 1 | (tail > head)
+    order = np.argsort(edge)
+    order = order[(tail != head)[order]]
+    edge, face, links = edge[order], order // 3, []
+    one, step = np.arange(len(order)), 0
+    while len(one):  # two faces share an edge, as a rule: after the first step few are left
+        step += 1
+        one = one[: np.searchsorted(one, len(order) - step)]
+        one = one[edge[one] >> 1 == edge[one + step] >> 1]
+        f, g = face[one], face[one + step]
+        level = np.einsum("ij,ij->i", normal[f], normal[g]) > 1 - 1e-6
+        links.append(np.array([f, g])[:, level & (edge[one] != edge[one + step])])
+    return components(len(vertex), *np.hstack(links)) if links else np.arange(len(vertex))
 
 
 def _inside(points, triangles):

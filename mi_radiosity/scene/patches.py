@@ -52,7 +52,7 @@ class Patches:
 
 def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.ndarray) -> Patches:
     """Patches of the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
-    face, back = np.argsort(faces.rank)[sides // 2], sides % 2
+    face, back = faces.order[sides // 2], sides % 2
     sign, emits = np.where(back == 1, -1.0, 1.0)[:, None], (back == 0)[:, None]
     corners = faces.corners[face]
     return Patches(
@@ -81,7 +81,7 @@ def lift_of(faces: Faces) -> float:
 
 def patch_table(faces: Faces, patches: Patches) -> "mi.UInt32":
     """The patch of every side 2 · face + (1 for the back), NONE where there is none (UInt32 [2 · faces])."""
-    face, back = np.argsort(faces.rank)[patches.sides // 2], patches.sides % 2
+    face, back = faces.order[patches.sides // 2], patches.sides % 2
     table = np.full(2 * len(faces), NONE, dtype=np.uint32)
     table[2 * face + back] = np.arange(patches.count)
     return owned(mi.UInt32, table)

@@ -42,7 +42,9 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
         lit[_see_free(rays, lights, source, number)] = True
         a, b = (np.concatenate(ends) for ends in zip(*links))
         label = components(patches.count, a[b != NONE], b[b != NONE])
-        found = np.isin(label, label[lit])
+        found = np.zeros(patches.count, dtype=bool)
+        found[label[lit]] = True
+        found = found[label]
         dark = np.flatnonzero(~found)
         if len(dark) == 0 or last >= probes:
             break
