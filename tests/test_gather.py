@@ -188,7 +188,7 @@ def test_lamps_are_drawn_as_often_as_their_density_says(most, places, monkeypatc
 
 def test_camera_samples_are_uniform():
     """χ² at 99.9 % of the first numbers of many pixels, 5 samples each: pairs, and pairs of different draws."""
-    points = PixelPoints(20_000, 0, 5, 5, seed=3)
+    points = PixelPoints.of_all(20_000, 0, 5, 5, 0, seed=3)
     a, b, c = points.next_2d(), points.next_2d(), points.next_1d()
     for x, y in ((a.x, a.y), (b.x, b.y), (a.x, b.y), (a.y, c)):
         table = np.histogram2d(np.array(x), np.array(y), bins=8, range=((0, 1), (0, 1)))[0]
@@ -198,7 +198,7 @@ def test_camera_samples_are_uniform():
 def test_camera_samples_are_well_spread():
     """The mean over 16 samples of a smooth function has a tenth of the variance of independent ones, and no bias."""
     pixels, count = 4096, 16
-    points = PixelPoints(pixels, 0, count, count, seed=1)
+    points = PixelPoints.of_all(pixels, 0, count, count, 0, seed=1)
     p = points.next_2d()
     values = np.array(dr.block_sum(dr.sin(3 * p.x) * p.y, count)) / count
     exact = (1 - np.cos(3)) / 3 / 2
@@ -208,12 +208,21 @@ def test_camera_samples_are_well_spread():
     assert abs(values.mean() - exact) < 3.3 * (values.var() / pixels) ** 0.5
 
 
-def test_passes_of_a_picture_continue_each_other():
-    """Samples drawn in two passes are those of one."""
-    whole, parts = PixelPoints(10, 0, 8, 8, seed=0).next_2d().x, []
+def test_launches_of_a_pass_continue_each_other():
+    """Samples drawn in two launches are those of one."""
+    whole, parts = PixelPoints.of_all(10, 0, 8, 8, 0, seed=0).next_2d().x, []
     for first in (0, 4):
-        parts.append(np.array(PixelPoints(10, first, 4, 8, seed=0).next_2d().x).reshape(10, 4))
+        parts.append(np.array(PixelPoints.of_all(10, first, 4, 8, 0, seed=0).next_2d().x).reshape(10, 4))
     np.testing.assert_array_equal(np.array(whole).reshape(10, 8), np.concatenate(parts, axis=1))
+
+
+def test_passes_of_a_picture_continue_each_other():
+    """All samples of two passes are as well spread as those of one: 8 in 8 rows, columns and 2 × 4 boxes each."""
+    parts = [PixelPoints.of_all(50, 0, n, n, before, seed=0).next_2d() for n, before in ((2, 0), (6, 2))]
+    x, y = (np.hstack([np.array(p[k]).reshape(50, -1) for p in parts]) for k in (0, 1))
+    for wide, high in ((8, 1), (1, 8), (2, 4), (4, 2)):
+        cell = np.floor(x * wide) * high + np.floor(y * high)
+        assert (np.sort(cell, axis=1) == np.arange(8)).all()
 
 
 def test_denoised_pictures_are_closer(solution, reference):

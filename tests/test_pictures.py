@@ -52,12 +52,11 @@ class Counted:
     """A picture that counts, ``step`` samples at a time, and takes a while to finish."""
 
     def __init__(self, clock, step=1, last=0.0):
-        self.clock, self.step, self.last, self.passes, self.seeds = clock, step, last, [], []
+        self.clock, self.step, self.last, self.passes = clock, step, last, []
 
-    def add(self, spp, seed):
+    def add(self, spp):
         self.clock.now += spp
         self.passes.append(spp)
-        self.seeds.append(seed)
 
     def preview(self):
         return sum(self.passes)
@@ -73,9 +72,9 @@ def test_passes_grow_and_fill_the_time(seconds, step, last, monkeypatch):
     clock, told = Clock(), []
     monkeypatch.setattr(pixels, "time", clock)
     picture = Counted(clock, step, last)
-    done = pixels.grow(picture, 0, seconds, lambda image, samples: told.append((image(), samples)))
+    done = pixels.grow(picture, seconds, lambda image, samples: told.append((image(), samples)))
     assert done == sum(picture.passes) == told[-1][1] and all(image == samples for image, samples in told)
-    assert len(set(picture.seeds)) == len(picture.seeds) and all(spp % step == 0 for spp in picture.passes)
+    assert all(spp % step == 0 for spp in picture.passes)
     left = seconds - last
     assert done == step if left < step else 0.85 * left - step <= done <= max(left, step)
     assert len(picture.passes) < 20
@@ -133,10 +132,10 @@ def test_seconds_on_the_command_line(tmp_path, capsys):
 def test_an_interrupt_keeps_the_best_so_far(tmp_path, capsys, monkeypatch):
     out, add = tmp_path / "box.exr", pixels.FilmPicture.add
 
-    def interrupted(self, spp, seed):
+    def interrupted(self, spp):
         if spp > 2:
             raise KeyboardInterrupt
-        add(self, spp, seed)
+        add(self, spp)
 
     monkeypatch.setattr(pixels.FilmPicture, "add", interrupted)
     assert main(["render", BOX, "-o", str(out), "--seconds", "60", "--elements", "200", "--rays", "9000"]) == 130
@@ -183,9 +182,10 @@ def test_denoising_parts_of_pixels_keeps_edges(box, solution):
     true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(8)], axis=0)[..., :3]
     integrator = mi.load_dict({"type": "radiosity"})
     integrator.show(solution, "gather")
-    picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample)
-    picture.add(62, seed=1)
-    assert picture._count * picture.step == 64 and picture._seen * picture.step == denoise.FEATURE_SPP
+    picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample, seed=1)
+    picture.add(62)
+    assert (picture._counts[0] == 64 / picture.step).all()
+    assert (picture._counts[1] == denoise.FEATURE_SPP / picture.step).all()
 
     def error(image):
         return np.sqrt(np.mean((np.clip(image, 0, 1) - np.clip(true, 0, 1)) ** 2))
@@ -193,10 +193,48 @@ def test_denoising_parts_of_pixels_keeps_edges(box, solution):
     assert error(picture.image()) < 0.8 * error(picture.preview())
 
 
+def test_camera_rays_are_mitsubas():
+    """Of all pixels, from the same numbers; with a lens, a shutter, and a part of the film only."""
+    from mitsuba.python.ad.integrators.common import ADIntegrator
+
+    film = {"width": 40, "height": 30, "crop_width": 12, "crop_height": 6, "crop_offset_x": 7, "crop_offset_y": 9}
+    lens = {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 2.0, "shutter_close": 1.5}
+    parts = {"type": "scene", "camera": lens | {"film": {"type": "hdrfilm", "rfilter": {"type": "box"}} | film}}
+    scene, spp = mi.load_dict(parts), 4
+    draw = lambda: pixels.PixelPoints.of_all(12 * 6, 0, spp, spp, 0, seed=5)
+    theirs, _, _ = ADIntegrator.sample_rays(None, scene, scene.sensors()[0], draw())
+    ours, _ = pixels.camera_rays(scene.sensors()[0], 12, 6, dr.arange(mi.UInt32, 12 * 6 * spp) // spp, draw())
+    for a, b in ((ours.o, theirs.o), (ours.d, theirs.d), (ours.time, theirs.time)):
+        np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-6)
+
+
+def noise_in_a_corner(scene, points, ray):
+    """Black or white, by chance, in the lower left of the picture; grey elsewhere."""
+    corner = (ray.d.x > 0.15) & (ray.d.y < -0.15)
+    return mi.Color3f(dr.select(corner, dr.select(points.next_1d() < 0.3, 1.0, 0.0), 0.5)), True, []
+
+
+def test_more_samples_are_taken_where_denoised_halves_differ(box):
+    """As many in all as asked for, a quarter of them everywhere; the same ones every time; the mean is right."""
+    pytest.importorskip("mitsuba_oidn")
+    pictures = [denoise.CleanPicture(box, box.sensors()[0], noise_in_a_corner, seed=3) for _ in range(2)]
+    for picture in pictures:
+        picture.take(64)
+    counts = pictures[0]._counts[0] * picture.step
+    np.testing.assert_array_equal(counts, pictures[1]._counts[0] * picture.step)
+    np.testing.assert_array_equal(*(np.array(picture.image()) for picture in pictures))
+    assert counts.mean() == pytest.approx(64, rel=0.02) and counts.min() >= 16
+    means = pictures[0]._means()[0][..., 0]
+    noisy = (means != 0.5) | (counts > 2 * np.median(counts))
+    assert 0.02 < noisy.mean() < 0.3 and counts[noisy].mean() > 3 * counts[~noisy].mean()
+    n = counts[means != 0.5].sum() / picture.step
+    assert np.average(means[means != 0.5], weights=counts[means != 0.5]) == pytest.approx(0.3, abs=4 * 0.46 / n**0.5)
+
+
 def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     """The better, the more time there is; parts of pixels of enough samples only; and the last image has its time."""
     pytest.importorskip("mitsuba_oidn")
-    picture = denoise.CleanPicture(box, box.sensors()[0], None)
+    picture = denoise.CleanPicture(box, box.sensors()[0], None, 0)
     least, *_, best = denoise.WAYS
     monkeypatch.setattr(denoise.CleanPicture, "_pace", picture._pace / picture._takes(least))  # the cheapest: 1 s
     planned = [picture.finishing(seconds, 64) for seconds in range(30)]

@@ -2,20 +2,26 @@
 
 import time
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import opaque_index, owned
+from ..core.color import srgb
 from ..core.errors import RadiosityError
 from ..core.extras import optional
-from .pixels import passes
+from .pixels import AT_ONCE, PixelPoints, camera_rays
 
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
+LEAST_KNOWN = 8  # samples per pixel, from which on more of them are taken where they are needed
+LEAST_ERROR = 0.1  # of the mean, that every pixel is taken to have
+MOST = 16  # times the mean that a pixel gets of all samples
+TELLING = 0.15  # of the time of samples, that may be spent on where they are needed
+SMOOTH = 1.5  # pixels that the error of one is judged by
 LATE = 1.3  # times what is left of the time, which the last image may take
 
 
@@ -43,48 +49,136 @@ def require_denoiser() -> Any:
 
 
 class CleanPicture:
-    """A picture [height, width, 3] of ``sample(scene, sampler, ray)`` that takes more and more samples, denoised.
+    """A picture [height, width, 3] of ``sample(scene, points, ray)`` that takes more and more samples, denoised.
 
     Samples are averaged over quarters of pixels, as the denoiser needs numbers that are independent, with albedo and
     normals of the surfaces seen. The film's own filter is applied afterwards, to quarters, if there are enough samples
-    to denoise these: edges are then as smooth as it makes them. draw: `passes`, or another source of samples.
+    to denoise these: edges are then as smooth as it makes them.
+
+    After the first samples more are taken where two pictures, of a half of them each, differ once they are denoised:
+    not where noise is, but where the denoiser cannot tell it from what is there. draw: what makes the points of given
+    samples, if not `PixelPoints`.
     """
 
     step = FINE**2  # samples per pixel are multiples of it
     _pace = 1e-6  # seconds that the cheapest way takes per pixel; as it was last time
 
-    def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, draw: Callable = passes) -> None:
-        self._denoiser, self._scene, self._sensor, self._sample = require_denoiser(), scene, _Fine(sensor), sample
-        if sensor.film().sample_border():
+    def __init__(
+        self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, seed: int, draw: Callable = PixelPoints
+    ) -> None:
+        self._denoiser, self._scene, self._sensor, self._sample = require_denoiser(), scene, sensor, sample
+        film = sensor.film()
+        if film.sample_border():
             raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
-        self._draw, self._rfilter = draw, sensor.film().rfilter()
-        width, height = self._sensor.film().crop_size()
-        # Sums of radiance, albedo and normals; and of how many samples of each part.
-        self._sums, self._count, self._seen = np.zeros((3, height, width, 3), np.float32), 0, 0
+        self._draw, self._seed, self._rfilter = draw, seed, film.rfilter()
+        width, height = (FINE * int(size) for size in film.crop_size())
+        # Of every part sums over samples of radiance, albedo and normals; how many have the first, and the others; and
+        # radiance of one half of the samples less the other.
+        self._sums, self._counts = np.zeros((3, height, width, 3), np.float32), np.zeros((2, height, width), np.int64)
+        self._apart = np.zeros((height, width, 3), np.float32)
+        self._each, self._spent = 0, 0.0  # samples of a part in the mean, and the seconds that they took
 
-    def add(self, spp: int, seed: int) -> None:
-        """Take ``spp`` more samples per pixel, rounded up to a multiple of ``step``; another seed every time."""
-        each, enough = -(-spp // self.step), FEATURE_SPP // self.step
-        pixels = self._sums[0, ..., 0].size
-        for points in self._draw(pixels, each, seed, min(max(enough - self._seen, 0), each)):
-            look = self._seen < enough
-            planes = _plane_sums(self._scene, self._sensor, points, self._sample, look)
-            self._sums[: len(planes)] += planes.reshape(-1, *self._sums.shape[1:])
-            self._count += points.sample_count()
-            self._seen += points.sample_count() if look else 0
+    def add(self, spp: int) -> None:
+        """Take ``spp`` more samples per pixel in the mean, rounded up to a multiple of ``step``; where they are
+        needed, if it takes little time to tell."""
+        each = -(-spp // self.step)
+        little = 2 * self._takes(WAYS[0]) <= TELLING * each * self._spent / max(self._each, 1)
+        self._add(each, little and self._each * self.step >= LEAST_KNOWN)
+
+    def take(self, spp: int) -> None:
+        """All samples of a picture, ``spp`` per pixel: a quarter everywhere, the others where they are needed."""
+        least, most = LEAST_KNOWN // self.step, -(-spp // self.step)
+        while self._each < most:
+            each = max(self._each, -(-most // 4), least)
+            self._add(min(each, most - self._each), self._each >= least)
+
+    def _add(self, each, where_needed):
+        """Take so many more samples of every part in the mean."""
+        counts = self._shares(each) if where_needed else np.full_like(self._counts[0], each)
+        start, look = time.perf_counter(), np.clip(FEATURE_SPP // self.step - self._counts[1], 0, counts)
+        before = self._counts[0].copy()
+        self._take(look, counts, before, True)
+        self._take(counts - look, counts, before, False)
+        self._each += each
+        self._spent += time.perf_counter() - start
+
+    def _take(self, counts, total, before, look):
+        """Take ``counts`` more samples of parts, of a pass of ``total``, which had so many ``before`` (int [height,
+        width])."""
+        height, width = counts.shape
+        first = (self._counts[0] - before).ravel()
+        counts, total, before = (x.ravel() for x in (counts, total, before))
+        chosen = np.flatnonzero(counts)
+        launch = (np.cumsum(counts[chosen]) - 1) // AT_ONCE
+        for parts in np.split(chosen, np.flatnonzero(np.diff(launch)) + 1):
+            if len(parts) == 0:
+                return
+            count = counts[parts]
+            start, row = np.cumsum(count) - count, np.repeat(np.arange(len(parts)), count)
+            index = np.arange(len(row)) + (first[parts] - start)[row]
+            of_samples = parts[row], index, total[parts][row], before[parts][row]
+            part, index, *others = (owned(mi.UInt32, x) for x in of_samples)
+            points = self._draw(part, index, *others, self._seed)
+            planes = self._planes(points, *camera_rays(self._sensor, width, height, part, points), look)
+            # Halves take turns in every part, and begin with neighbouring parts: in a pixel they are as many.
+            wide = opaque_index(width)
+            planes.append(planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
+            *sums, apart = (np.add.reduceat(np.array(plane), start, axis=1).T for plane in planes)
+            self._apart.reshape(-1, 3)[parts] += apart
+            self._sums.reshape(3, -1, 3)[: len(sums), parts] += sums
+            self._counts.reshape(2, -1)[: 1 + look, parts] += count
+
+    def _planes(self, points, ray, weight, look):
+        """Radiance of samples, and if there is a ``look``, albedo and normal (Color3f [n])."""
+        radiance, _, _ = self._sample(self._scene, points, ray)
+        planes = [mi.Color3f(radiance * weight)]
+        if look:
+            si = self._scene.ray_intersect(ray)
+            valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
+            albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
+            albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
+            planes += [mi.Color3f(albedo), dr.select(valid, normal, 0)]
+        dr.eval(planes)
+        return planes
+
+    def _shares(self, each):
+        """How many of ``each`` samples in the mean every part gets (int [height, width]), for the sum of errors to be
+        least; judged by how far two denoised halves are apart in 8-bit sRGB."""
+        ndimage: Any = optional("scipy.ndimage", "denoising", "denoise")
+        (color, *features), taken = self._means(), self._counts[0, ::FINE, ::FINE]
+        apart = self._apart / self._counts[0, ..., None]
+        halves = ([_whole(x) for x in (half, *features)] for half in (color + apart, color - apart))
+        one, other = (srgb(self._denoised(planes, WAYS[0])) for planes in halves)
+        error = ndimage.gaussian_filter(np.mean((one - other) ** 2, axis=2), SMOOTH)
+        # That of well spread samples falls about as the square of how many they are.
+        weight = np.cbrt(np.maximum(error, LEAST_ERROR * error.mean() + 1e-9) * taken**2)
+        low, high = 0.0, (each + taken.max()) / weight.min()
+        for _ in range(64):
+            scale = (low + high) / 2
+            more = np.clip(np.minimum(scale * weight, MOST * (self._each + each)) - taken, 0, None)
+            low, high = (scale, high) if more.mean() < each else (low, scale)
+        more = np.floor(more + np.random.default_rng([self._seed & 0xFFFFFFFF, self._each]).random(more.shape)).astype(
+            np.int64
+        )
+        return np.repeat(np.repeat(more, FINE, axis=0), FINE, axis=1)
+
+    def _means(self):
+        """Means of radiance, albedo and normals (three [height, width, 3])."""
+        return [sums / self._counts[min(k, 1), ..., None].astype(np.float32) for k, sums in enumerate(self._sums)]
+
+    def _denoised(self, planes, way):
+        """Radiance without its noise, of it with albedo and normals, at the quality of a way."""
+        color, albedo, normal = (np.ascontiguousarray(plane, np.float32) for plane in planes)
+        how = {"hdr": True, "clean_aux": True, "quality": getattr(self._denoiser.Quality, way.quality)}
+        return np.asarray(self._denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, **how))
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
         most = np.inf if seconds is None else LATE * seconds
-        way = self._way(self._count * self.step, lambda way: self._takes(way) <= most)
-        start, counts = time.perf_counter(), np.array([self._count, self._seen, self._seen], np.float32)
-        planes = self._sums / counts.reshape(3, 1, 1, 1)
-        if way.parts == 1:
-            planes = np.mean([planes[:, i::FINE, j::FINE] for i in range(FINE) for j in range(FINE)], axis=0)
-        color, albedo, normal = planes
-        how = {"hdr": True, "clean_aux": True, "quality": getattr(self._denoiser.Quality, way.quality)}
-        clean = self._denoiser.denoise(color, albedo=np.clip(albedo, 0, 1), normal=normal, **how)
-        image = mi.TensorXf(_filtered(np.asarray(clean), self._rfilter, way.parts))
+        way = self._way(self._each * self.step, lambda way: self._takes(way) <= most)
+        start, planes = time.perf_counter(), self._means()
+        clean = self._denoised(planes if way.parts > 1 else map(_whole, planes), way)
+        image = mi.TensorXf(_filtered(clean, self._rfilter, way.parts))
         CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
         return image
 
@@ -98,7 +192,7 @@ class CleanPicture:
 
     def _takes(self, way):
         """Seconds that a way takes, by what the last one did."""
-        return way.cost * self._pace * self._sums[0, ..., 0].size / FINE**2
+        return way.cost * self._pace * self._counts[0].size / FINE**2
 
     def _way(self, spp, allowed):
         """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
@@ -106,48 +200,9 @@ class CleanPicture:
         return (ways or WAYS[:1])[-1]
 
 
-class _Fine:
-    """A sensor whose pixels are FINE times smaller, and all that counts."""
-
-    def __init__(self, sensor: "mi.Sensor") -> None:
-        film, box = sensor.film(), mi.load_dict({"type": "box"})
-        size, offset = FINE * mi.ScalarVector2u(film.crop_size()), FINE * mi.ScalarPoint2u(film.crop_offset())
-        self._sensor = sensor
-        self._film = SimpleNamespace(
-            crop_size=lambda: mi.ScalarVector2u(size),
-            crop_offset=lambda: offset,
-            rfilter=lambda: box,
-            sample_border=lambda: False,
-        )
-
-    def film(self) -> SimpleNamespace:
-        return self._film
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._sensor, name)
-
-
-def _plane_sums(scene, sensor, points, sample, look):
-    """Sums over samples of radiance, and if there is one more ``look`` of albedo and normal [1 or 3, pixels, 3]."""
-    from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
-
-    ray, weight, _ = ADIntegrator.sample_rays(None, scene, sensor, points)
-    radiance, _, _ = sample(scene, points, ray)
-    if not look:
-        return _pixel_sums([mi.Color3f(radiance * weight)], points.sample_count())
-    si = scene.ray_intersect(ray)
-    valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
-    albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
-    albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
-    planes = [mi.Color3f(radiance * weight), mi.Color3f(albedo), dr.select(valid, normal, 0)]
-    return _pixel_sums(planes, points.sample_count())
-
-
-def _pixel_sums(planes, count):
-    """Sums of so many samples of each pixel [planes, pixels, 3]."""
-    dr.eval(planes)  # in one go: sums one by one would trace all again
-    sums = [[dr.block_sum(c, count) for c in plane] for plane in planes]
-    return np.array(sums, dtype=np.float32).swapaxes(1, 2)
+def _whole(image):
+    """Means over the parts of pixels, of an image of parts [height, width, 3]."""
+    return sum(image[i::FINE, j::FINE] for i in range(FINE) for j in range(FINE)) / FINE**2
 
 
 def _filtered(image, rfilter, parts):

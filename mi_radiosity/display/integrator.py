@@ -80,11 +80,11 @@ def _integrator_class():
                 return self.render(scene, sensor, seed=seed, spp=spp)
             start = time.perf_counter()
             self.prepare(scene)
-            picture = (CleanPicture if denoise else FilmPicture)(scene, sensor, self._sample)
+            picture = (CleanPicture if denoise else FilmPicture)(scene, sensor, self._sample, seed)
             if seconds is None:
-                picture.add(spp, seed)
+                picture.take(spp)
             else:
-                grow(picture, seed, seconds - (time.perf_counter() - start), show or (lambda image, samples: None))
+                grow(picture, seconds - (time.perf_counter() - start), show or (lambda image, samples: None))
                 seconds -= time.perf_counter() - start
             return picture.image(seconds)
 
@@ -92,8 +92,8 @@ def _integrator_class():
             self.prepare(scene)
             chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             seed = int(seed[0] if dr.is_array_v(seed) else seed)
-            picture = FilmPicture(scene, chosen, self._sample)
-            picture.add(spp or chosen.sampler().sample_count(), seed)
+            picture = FilmPicture(scene, chosen, self._sample, seed)
+            picture.add(spp or chosen.sampler().sample_count())
             return picture.image() if develop else None
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):

@@ -19,17 +19,29 @@ class PixelPoints:
 
     Every pair of numbers is, over the samples of a pixel, a (0, 2)-sequence under a random digital shift, in an order
     of its own (Kollig and Keller 2002), so that each is well spread and no two go together. Unbiased for any number
-    of samples, unlike Mitsuba's stratified sampler at few.
+    of samples, unlike Mitsuba's stratified sampler at few. Another pass goes on where the last one ended.
 
-    pixels: how many; ``count`` samples of each, from number ``first`` of ``total``; ordered by pixel.
+    Of every sample its ``pixel``, its number there in this pass, ``index``, how many the pass has in ``total`` and how
+    many there were ``before`` (UInt32 [samples]).
     """
 
-    def __init__(self, pixels: int, first: int, count: int, total: int, seed: int) -> None:
-        self._count, self._total, self._dimension = count, opaque_index(total), 0
-        k = dr.arange(mi.UInt32, pixels * count)
-        each = dr.opaque(mi.UInt32, count)
-        self._pixel, self._index = k // each, dr.opaque(mi.UInt32, first) + k % each
+    _count = 0
+
+    def __init__(
+        self, pixel: "mi.UInt32", index: "mi.UInt32", total: "mi.UInt32", before: "mi.UInt32", seed: int
+    ) -> None:
+        self._pixel, self._index, self._before, self._dimension = pixel, index, before, 0
+        self._total = dr.maximum(total, 1)  # lanes beyond the last sample divide by it, too
         self._seed = dr.opaque(mi.UInt32, stream_seed(seed, Stream.PIXELS))
+
+    @classmethod
+    def of_all(cls, pixels: int, first: int, count: int, total: int, before: int, seed: int) -> "PixelPoints":
+        """``count`` samples of each of so many pixels, from number ``first`` of the pass on; ordered by pixel."""
+        k, each = dr.arange(mi.UInt32, pixels * count), opaque_index(count)
+        index = opaque_index(first) + k % each
+        points = cls(k // each, index, opaque_index(total), opaque_index(before), seed)
+        points._count = count
+        return points
 
     def sample_count(self) -> int:
         return self._count
@@ -39,7 +51,7 @@ class PixelPoints:
         self._dimension += 1
         order, x = mi.sample_tea_32(self._pixel, self._seed + self._dimension, ROUNDS)
         y, _ = mi.sample_tea_32(self._pixel ^ 0x5EED5EED, self._seed + self._dimension, ROUNDS)
-        return permuted(self._index, self._total, order), x, y
+        return self._before + permuted(self._index, self._total, order), x, y
 
     def next_1d(self) -> "mi.Float":
         index, x, _ = self._next()
@@ -50,20 +62,25 @@ class PixelPoints:
         return mi.Point2f(mi.radical_inverse_2(index, x), mi.sobol_2(index, y))
 
 
-def spans(pixels: int, spp: int, apart: int = 0) -> Iterator[tuple[int, int]]:
-    """``spp`` samples of each of so many pixels in launches of AT_ONCE samples, the first ``apart`` of them by
-    themselves: where each begins, and how many it takes."""
-    most, first = max(1, AT_ONCE // pixels), 0
-    while first < spp:
-        count = min(most, (apart if first < apart else spp) - first)
-        yield first, count
-        first += count
+def launches(pixels: int, before: int, spp: int, seed: int) -> Iterator[PixelPoints]:
+    """A pass of ``spp`` samples of each of so many pixels, AT_ONCE at a time, after so many ``before``."""
+    most = max(1, AT_ONCE // pixels)
+    for first in range(0, spp, most):
+        yield PixelPoints.of_all(pixels, first, min(most, spp - first), spp, before, seed)
 
 
-def passes(pixels: int, spp: int, seed: int, apart: int = 0) -> Iterator[PixelPoints]:
-    """The same as points."""
-    for first, count in spans(pixels, spp, apart):
-        yield PixelPoints(pixels, first, count, spp, seed)
+def camera_rays(
+    sensor: "mi.Sensor", width: int, height: int, pixel: "mi.UInt32", points: PixelPoints
+) -> "tuple[mi.RayDifferential3f, mi.Color3f]":
+    """Rays through points of pixels (UInt32 [n]) of a grid over all that the film shows, and their weights, as Mitsuba
+    draws those of all pixels."""
+    at = mi.Point2f(pixel % opaque_index(width), pixel // opaque_index(width)) + points.next_2d()
+    lens = points.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0)
+    time = sensor.shutter_open() + dr.zeros(mi.Float, dr.width(pixel))
+    if sensor.shutter_open_time() > 0:
+        time += points.next_1d() * sensor.shutter_open_time()
+    scale = mi.Vector2f(*(dr.opaque(mi.Float, 1 / size) for size in (width, height)))
+    return sensor.sample_ray_differential(time, 0, at * scale, lens)
 
 
 class FilmPicture:
@@ -72,17 +89,18 @@ class FilmPicture:
 
     step = 1
 
-    def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable) -> None:
+    def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, seed: int) -> None:
         self._scene, self._sensor, self._sample, self._film = scene, sensor, sample, sensor.film()
+        self._seed, self._done = seed, 0
         self._film.prepare([])
         border = 2 * self._film.rfilter().border_size() if self._film.sample_border() else 0
         self._pixels = int(dr.prod(self._film.crop_size() + border))
 
-    def add(self, spp: int, seed: int) -> None:
-        """Take ``spp`` more samples per pixel; another seed every time."""
+    def add(self, spp: int) -> None:
+        """Take ``spp`` more samples per pixel."""
         from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
 
-        for sampler in passes(self._pixels, spp, seed):
+        for sampler in launches(self._pixels, self._done, spp, self._seed):
             ray, weight, position = ADIntegrator.sample_rays(None, self._scene, self._sensor, sampler)
             radiance, valid, _ = self._sample(self._scene, sampler, ray)
             block = self._film.create_block()
@@ -93,6 +111,7 @@ class FilmPicture:
             )
             self._film.put_block(block)
             dr.eval(block.tensor())
+        self._done += spp
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What the film holds now [height, width, channels]."""
@@ -111,7 +130,7 @@ class Growing(Protocol):
 
     step: int
 
-    def add(self, spp: int, seed: int) -> None: ...
+    def add(self, spp: int) -> None: ...
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf": ...
 
@@ -120,7 +139,7 @@ class Growing(Protocol):
     def finishing(self, seconds: float, spp: int) -> float: ...
 
 
-def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, int], None]) -> int:
+def grow(picture: Growing, seconds: float, show: Callable[[Callable, int], None]) -> int:
     """Take samples until ``seconds`` are over, in passes that grow as far as they fit; returns how many per pixel.
 
     show(image, samples) is told after every pass; image() is the picture then. At least one step of samples is taken;
@@ -130,7 +149,7 @@ def grow(picture: Growing, seed: int, seconds: float, show: Callable[[Callable, 
     start, done, spp = time.perf_counter(), 0, picture.step
     while True:
         before = time.perf_counter()
-        picture.add(spp, stream_seed(seed, Stream.PIXELS, 1 + len(taken)))
+        picture.add(spp)
         dr.sync_thread()
         taken.append((spp, time.perf_counter() - before))
         done += spp

@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.points import Stream, stream_seed
 from ..display import SHADERS, CleanPicture
-from ..display.pixels import spans
+from ..display.pixels import AT_ONCE
 from ..scene import Model
 from ..solver import SOLVING_SHARE, solve
 from . import require_extra
@@ -198,16 +199,16 @@ def _denoised_path(scene, sensor, spp):
     """A picture by `path`, denoised as ours are."""
     integrator = mi.load_dict({"type": "path", "max_depth": -1})
 
-    def draw(pixels, spp, seed, apart):
-        for first, count in spans(pixels, spp, apart):
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.set_sample_count(count)
-            sampler.seed(seed + first, pixels * count)
-            yield sampler
+    def draw(pixel, index, total, before, seed):
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(stream_seed(seed, Stream.PIXELS, AT_ONCE * index[0] + pixel[0]), dr.width(pixel))
+        return sampler
 
     start = now()
-    picture = CleanPicture(scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), draw)
-    picture.add(spp, seed=spp)
+    picture = CleanPicture(
+        scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), seed=spp, draw=draw
+    )
+    picture.add(spp)  # all at once, so everywhere alike
     return np.array(picture.image(picture.finishing(ROOM * (now() - start), spp)))
 
 

@@ -14,6 +14,7 @@ CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 CORNERS = 8  # of a box
 GUESS = 12  # pairs of faces that are near each other, per face
 FINEST = 30  # a grid has up to 2^30 cells along an axis
+ABOUT = 0.999  # of the area of another face: as large, to float32
 LATTICE = 8  # points along a side that show whether a face is covered
 
 
@@ -138,8 +139,11 @@ class _Triangles:
 
     def near_plane(self, one: "tuple[mi.Vector4d, mi.Vector4d]", other: "tuple[mi.Vector4d, mi.Vector4d]") -> "mi.Bool":
         """May a corner of the smaller face be near the plane of the larger one (Bool [n])? Most pairs end here."""
-        heights = [n.x * p.x + n.y * p.y + n.z * p.z + n.w for (p, _), (_, n) in ((other, one), (one, other))]
-        return dr.abs(dr.select(one[0].w >= other[0].w, *heights)) <= self._twice
+        near = mi.Bool(False)
+        for (p, _), (large, n) in ((other, one), (one, other)):
+            height = n.x * p.x + n.y * p.y + n.z * p.z + n.w
+            near |= (dr.abs(height) <= self._twice) & (large.w >= ABOUT * p.w)
+        return near
 
     def boxes_meet(self, f: "mi.UInt32", g: "mi.UInt32", active: "mi.Bool") -> "mi.Bool":
         """Do the boxes of faces meet, not only at an edge (Bool [n])?"""
