@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import opaque_index, owned
+from ..core.arrays import lower_bound, opaque_index, owned
 from ..core.color import srgb
 from ..core.errors import RadiosityError
 from ..core.extras import optional
@@ -20,7 +20,8 @@ FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
 LEAST_KNOWN = 8  # samples per pixel, from which on more of them are taken where they are needed
 LEAST_ERROR = 0.1  # of the mean, that every pixel is taken to have
 MOST = 16  # times the mean that a pixel gets of all samples
-TELLING = 0.15  # of the time of samples, that may be spent on where they are needed
+TELLING = 0.2  # of the time of samples, that may be spent on where they are needed
+DEARER = 1.2  # times what others take: samples there, as much of it is gloss and glass
 SMOOTH = 1.5  # pixels that the error of one is judged by
 LATE = 1.3  # times what is left of the time, which the last image may take
 
@@ -60,7 +61,7 @@ class CleanPicture:
     samples, if not `PixelPoints`.
     """
 
-    step = FINE**2  # samples per pixel are multiples of it
+    step, known = FINE**2, LEAST_KNOWN  # samples per pixel are multiples of the first
     _pace = 1e-6  # seconds that the cheapest way takes per pixel; as it was last time
 
     def __init__(
@@ -78,12 +79,15 @@ class CleanPicture:
         self._apart = np.zeros((height, width, 3), np.float32)
         self._each, self._spent = 0, 0.0  # samples of a part in the mean, and the seconds that they took
 
-    def add(self, spp: int) -> None:
-        """Take ``spp`` more samples per pixel in the mean, rounded up to a multiple of ``step``; where they are
-        needed, if it takes little time to tell."""
-        each = -(-spp // self.step)
-        little = 2 * self._takes(WAYS[0]) <= TELLING * each * self._spent / max(self._each, 1)
-        self._add(each, little and self._each * self.step >= LEAST_KNOWN)
+    def add(self, spp: int) -> int:
+        """Take ``spp`` more samples per pixel in the mean, rounded up to a multiple of ``step``, everywhere; or as many
+        as fit into the same time where they are needed, if it takes little of it to tell. Returns how many."""
+        each, seconds, telling = -(-spp // self.step), self._spent / max(self._each, 1), 2 * self._takes(WAYS[0])
+        where_needed = self._each * self.step >= LEAST_KNOWN and telling <= TELLING * each * seconds
+        if where_needed:
+            each = max(1, int((each - telling / seconds) / DEARER))
+        self._add(each, where_needed)
+        return each * self.step
 
     def take(self, spp: int) -> None:
         """All samples of a picture, ``spp`` per pixel: a quarter everywhere, the others where they are needed."""
@@ -114,16 +118,22 @@ class CleanPicture:
             if len(parts) == 0:
                 return
             count = counts[parts]
-            start, row = np.cumsum(count) - count, np.repeat(np.arange(len(parts)), count)
-            index = np.arange(len(row)) + (first[parts] - start)[row]
-            of_samples = parts[row], index, total[parts][row], before[parts][row]
-            part, index, *others = (owned(mi.UInt32, x) for x in of_samples)
-            points = self._draw(part, index, *others, self._seed)
+            end = np.cumsum(count)
+            k = dr.arange(mi.UInt32, int(end[-1]))
+            alike = count.min() == count.max()
+            row = k // opaque_index(int(count[0])) if alike else lower_bound(owned(mi.UInt32, end), k + 1)
+            tables = parts, end - count, first[parts], total[parts], before[parts]
+            part, start, index, of, done = (dr.gather(mi.UInt32, owned(mi.UInt32, table), row) for table in tables)
+            index += k - start
+            dr.eval(part, index, of, done)
+            points = self._draw(part, index, of, done, self._seed)
             planes = self._planes(points, *camera_rays(self._sensor, width, height, part, points), look)
             # Halves take turns in every part, and begin with neighbouring parts: in a pixel they are as many.
             wide = opaque_index(width)
             planes.append(planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
-            *sums, apart = (np.add.reduceat(np.array(plane), start, axis=1).T for plane in planes)
+            *sums, apart = _sums_of_runs(planes, count)
+            if len(parts) == parts[-1] + 1 - parts[0]:
+                parts = slice(parts[0], parts[-1] + 1)  # which is faster
             self._apart.reshape(-1, 3)[parts] += apart
             self._sums.reshape(3, -1, 3)[: len(sums), parts] += sums
             self._counts.reshape(2, -1)[: 1 + look, parts] += count
@@ -146,21 +156,20 @@ class CleanPicture:
         least; judged by how far two denoised halves are apart in 8-bit sRGB."""
         ndimage: Any = optional("scipy.ndimage", "denoising", "denoise")
         (color, *features), taken = self._means(), self._counts[0, ::FINE, ::FINE]
-        apart = self._apart / self._counts[0, ..., None]
+        apart = self._apart / self._counts[0, ..., None].astype(np.float32)
         halves = ([_whole(x) for x in (half, *features)] for half in (color + apart, color - apart))
         one, other = (srgb(self._denoised(planes, WAYS[0])) for planes in halves)
-        error = ndimage.gaussian_filter(np.mean((one - other) ** 2, axis=2), SMOOTH)
+        error = ndimage.gaussian_filter(np.nan_to_num(np.mean((one - other) ** 2, axis=2)), SMOOTH)
         # That of well spread samples falls about as the square of how many they are.
-        weight = np.cbrt(np.maximum(error, LEAST_ERROR * error.mean() + 1e-9) * taken**2)
+        taken = taken.astype(np.float32)
+        weight = np.cbrt(np.maximum(error, LEAST_ERROR * error.mean() + 1e-9) * taken**2).astype(np.float32)
         low, high = 0.0, (each + taken.max()) / weight.min()
-        for _ in range(64):
+        for _ in range(30):
             scale = (low + high) / 2
             more = np.clip(np.minimum(scale * weight, MOST * (self._each + each)) - taken, 0, None)
             low, high = (scale, high) if more.mean() < each else (low, scale)
-        more = np.floor(more + np.random.default_rng([self._seed & 0xFFFFFFFF, self._each]).random(more.shape)).astype(
-            np.int64
-        )
-        return np.repeat(np.repeat(more, FINE, axis=0), FINE, axis=1)
+        dither = np.random.default_rng([self._seed & 0xFFFFFFFF, self._each]).random(more.shape)
+        return np.repeat(np.repeat(np.int64(more + dither), FINE, axis=0), FINE, axis=1)
 
     def _means(self):
         """Means of radiance, albedo and normals (three [height, width, 3])."""
@@ -198,6 +207,16 @@ class CleanPicture:
         """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
         ways = [way for way in WAYS if allowed(way) and (way.parts == 1 or spp >= LEAST_FINE)]
         return (ways or WAYS[:1])[-1]
+
+
+def _sums_of_runs(planes, count):
+    """Sums over runs of so many samples of colours [planes, runs, 3]."""
+    dr.eval(planes)
+    if count.min() == count.max():
+        sums = [[dr.block_sum(channel, int(count[0])) for channel in plane] for plane in planes]
+        return np.array(sums, dtype=np.float32).swapaxes(1, 2)
+    start = np.cumsum(count) - count
+    return [np.add.reduceat(np.array(plane), start, axis=1).T for plane in planes]
 
 
 def _whole(image):

@@ -87,7 +87,7 @@ class FilmPicture:
     """A picture on the film of a sensor that takes more and more camera samples of
     ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
 
-    step = 1
+    step, known = 1, 0
 
     def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, seed: int) -> None:
         self._scene, self._sensor, self._sample, self._film = scene, sensor, sample, sensor.film()
@@ -96,8 +96,8 @@ class FilmPicture:
         border = 2 * self._film.rfilter().border_size() if self._film.sample_border() else 0
         self._pixels = int(dr.prod(self._film.crop_size() + border))
 
-    def add(self, spp: int) -> None:
-        """Take ``spp`` more samples per pixel."""
+    def add(self, spp: int) -> int:
+        """Take ``spp`` more samples per pixel; returns how many were taken."""
         from mitsuba.python.ad.integrators.common import ADIntegrator  # there once a variant is
 
         for sampler in launches(self._pixels, self._done, spp, self._seed):
@@ -112,6 +112,7 @@ class FilmPicture:
             self._film.put_block(block)
             dr.eval(block.tensor())
         self._done += spp
+        return spp
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What the film holds now [height, width, channels]."""
@@ -125,12 +126,14 @@ class FilmPicture:
 
 
 class Growing(Protocol):
-    """A FilmPicture, or one that is denoised: takes samples in multiples of ``step``; ``image`` is as good as it gets
-    in so many seconds, and ``preview`` takes little; ``finishing`` is what an image should take of all seconds."""
+    """A FilmPicture, or one that is denoised: takes samples in multiples of ``step``, and from so many ``known`` on
+    where they are needed; ``image`` is as good as it gets in so many seconds, and ``preview`` takes little;
+    ``finishing`` is what an image should take of all seconds."""
 
     step: int
+    known: int
 
-    def add(self, spp: int) -> None: ...
+    def add(self, spp: int) -> int: ...
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf": ...
 
@@ -149,7 +152,7 @@ def grow(picture: Growing, seconds: float, show: Callable[[Callable, int], None]
     start, done, spp = time.perf_counter(), 0, picture.step
     while True:
         before = time.perf_counter()
-        picture.add(spp)
+        spp = picture.add(spp)
         dr.sync_thread()
         taken.append((spp, time.perf_counter() - before))
         done += spp
@@ -165,6 +168,8 @@ def grow(picture: Growing, seconds: float, show: Callable[[Callable, int], None]
         spp = (GROWTH if len(taken) > 1 else 2) * spp
         if fits < GROWTH * spp:  # rather one pass of all that fits than a small one at the end
             spp = fits
+        if done < picture.known:
+            spp = min(spp, picture.known - done)
 
 
 def _costs(taken):
