@@ -42,15 +42,11 @@ class Model:
         overlaps = self._find_overlaps()
         self.unreached = 0
         patches = self._patches(self._sides(self._candidate & ~overlaps.covered) if sides is None else sides)
-        if sides is None and lit and patches.count:
+        if sides is None and lit:
             found = reached(self._rays(patches, overlaps), self.lights)
             self.unreached = int((~found).sum())
             if self.unreached:
                 patches = self._patches(patches.sides[found])
-        if not patches.count:
-            raise RadiosityError(
-                "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
-            )
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
         self.rays = self._rays(patches, kept)
@@ -85,6 +81,10 @@ class Model:
         )
 
     def _patches(self, sides):
+        if not len(sides):
+            raise RadiosityError(
+                "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
+            )
         return make_patches(self.faces, self.materials, self.lights, sides)
 
     def _rays(self, patches, overlaps):
