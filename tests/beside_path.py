@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-RUNS, SPP, TRUE_SPP = 6, 64, 256
+RUNS, SPP, TRUE_SPP = 8, 64, 256
 DOUBT = 1e-4  # of all comparisons of one call together
 FEW = 12  # pixels that make no mean
 
@@ -41,10 +41,8 @@ def compare(scene, bias=0.01, shading="gather", depth=-1, aside=None, **budget):
     solutions = [mr.solve(scene, seed=seed, **budget) for seed in range(RUNS)]
     ours = np.array([means(s.render(spp=SPP, shading=shading, seed=seed)) for seed, s in enumerate(solutions)])
     true = np.array([means(mi.render(scene, integrator=path, spp=TRUE_SPP, seed=seed)) for seed in range(RUNS)])
-    a, b = (x.var(axis=0, ddof=1) / RUNS for x in (ours, true))
-    error = np.sqrt(a + b)
-    freedom = (RUNS - 1) * np.maximum((a + b) ** 2 / np.maximum(a**2 + b**2, 1e-300), 1)  # Welch, Satterthwaite
-    sure = stats.t.ppf(1 - DOUBT / (2 * error.size), freedom)
+    error = np.hypot(*(x.std(axis=0, ddof=1) / RUNS**0.5 for x in (ours, true)))
+    sure = stats.t.ppf(1 - DOUBT / (2 * error.size), RUNS - 1)
     off, want = np.abs(ours.mean(axis=0) - true.mean(axis=0)), true.mean(axis=0)
     biases = {None: bias / 2} | (aside or {})
     allowed = np.array([biases.get(name, bias) for name in names])[:, None]

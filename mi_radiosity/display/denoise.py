@@ -148,7 +148,6 @@ class CleanPicture:
             albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
             albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
             planes += [mi.Color3f(albedo), dr.select(valid, normal, 0)]
-        dr.eval(planes)
         return planes
 
     def _shares(self, each):

@@ -137,7 +137,7 @@ class _Triangles:
         """A corner and the area of faces, and their planes."""
         return tuple(dr.gather(mi.Vector4f, x, face, active) for x in (self._first, self._plane))
 
-    def near_plane(self, one: "tuple[mi.Vector4d, mi.Vector4d]", other: "tuple[mi.Vector4d, mi.Vector4d]") -> "mi.Bool":
+    def near_plane(self, one: "tuple[mi.Vector4f, mi.Vector4f]", other: "tuple[mi.Vector4f, mi.Vector4f]") -> "mi.Bool":
         """May a corner of the smaller face be near the plane of the larger one (Bool [n])? Most pairs end here."""
         near = mi.Bool(False)
         for (p, _), (large, n) in ((other, one), (one, other)):
