@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mi_radiosity as mr
 from mi_radiosity.cli import main
+from mi_radiosity.evaluation import bench as benchmark
 from mi_radiosity.evaluation import metrics, plots, reference, speed, tables
 from mi_radiosity.evaluation.bench import crossing, run_bench
 from mi_radiosity.evaluation.cells import Cell, InProcess, Study, executor_for, run_cells
@@ -120,6 +121,21 @@ def test_crossing_of_curves():
     assert result["seconds"] == pytest.approx(100 * (4 / 5) ** 2, rel=0.01)
     assert result["rmse_a"] == pytest.approx(5) and result["ours_seconds"] == pytest.approx(10)
     assert crossing(points((1, 10), (10, 5)), points((1, 40), (9, 20)))["seconds"] is None
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("least, longest, last", [(0.3, 100, 16), (0.05, 9, 8), (0.05, 1, 4), (2, 100, 4)])
+def test_our_times_go_on_until_the_other_is_reached(least, longest, last, monkeypatch):
+    """In error or in time, and as they were asked for at least."""
+    monkeypatch.setattr(benchmark, "_timed", lambda attempt, views: attempt(views))
+    other = [{"seconds": longest, "rmse_a_clean": least}, {"seconds": longest / 4, "rmse_a_clean": 2 * least}]
+    views = benchmark.Views([], [])
+
+    def attempt(seconds, views):
+        return {"seconds": seconds, "rmse_a_clean": 1 / seconds**0.5}
+
+    points = benchmark._within_times(attempt, (1, 2, 4), other, views, lambda done, total: None)
+    assert [p["seconds"] for p in points] == [2**k for k in range(len(points))] and points[-1]["seconds"] == last
 
 
 # ---- References ------------------------------------------------------------------------------------

@@ -49,12 +49,10 @@ class Clock:
 
 
 class Counted:
-    """A picture that counts, ``step`` samples at a time, and takes a while to finish."""
+    """A picture that counts, ``least`` samples at first, and takes a while to finish."""
 
-    known = 8
-
-    def __init__(self, clock, step=1, last=0.0):
-        self.clock, self.step, self.last, self.passes = clock, step, last, []
+    def __init__(self, clock, least=1, last=0.0):
+        self.clock, self.least, self.last, self.passes = clock, least, last, []
 
     def add(self, spp):
         self.clock.now += spp
@@ -68,18 +66,18 @@ class Counted:
         return self.last
 
 
-@pytest.mark.parametrize("step, last", [(1, 0.0), (4, 0.0), (1, 7.0), (4, 7.0)])
+@pytest.mark.parametrize("least, last", [(1, 0.0), (4, 0.0), (1, 7.0), (4, 7.0)])
 @pytest.mark.parametrize("seconds", [0.5, 3, 10, 1000])
-def test_passes_grow_and_fill_the_time(seconds, step, last, monkeypatch):
-    """In whole steps, and leave what the last image takes."""
+def test_passes_grow_and_fill_the_time(seconds, least, last, monkeypatch):
+    """From the least there are, and leave what the last image takes."""
     clock, told = Clock(), []
     monkeypatch.setattr(pixels, "time", clock)
-    picture = Counted(clock, step, last)
+    picture = Counted(clock, least, last)
     done = pixels.grow(picture, seconds, lambda image, samples: told.append((image(), samples)))
     assert done == sum(picture.passes) == told[-1][1] and all(image == samples for image, samples in told)
-    assert all(spp % step == 0 for spp in picture.passes)
+    assert picture.passes[0] == least
     left = seconds - last
-    assert done == step if left < step else 0.85 * left - step <= done <= max(left, step)
+    assert done == least if left < least else 0.85 * left - 1 <= done <= max(left, least)
     assert len(picture.passes) < 20
 
 
@@ -179,16 +177,17 @@ def test_filtered_parts_are_pixels_in_their_place(parts):
 
 
 def test_denoising_parts_of_pixels_keeps_edges(box, solution):
-    """Beside `path` under the film's own filter the picture is better than if whole pixels were denoised; and what it
-    is made of is as much as was asked for, in whole steps."""
+    """Beside `path` under the film's own filter the picture is better than if whole pixels were denoised; and every
+    pixel has as many samples as were asked for."""
     pytest.importorskip("mitsuba_oidn")
     true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(8)], axis=0)[..., :3]
     integrator = mi.load_dict({"type": "radiosity"})
     integrator.show(solution, "gather")
     picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample, seed=1)
     picture.add(62)
-    assert (picture._counts[0] == 64 / picture.step).all()
-    assert (picture._counts[1] == denoise.FEATURE_SPP / picture.step).all()
+    colors, features = picture._counts
+    assert (picture._taken() == 62).all() and colors.min() == 15 and colors.max() == 16
+    assert (features == denoise.FEATURE_SPP / denoise.FINE**2).all()
 
     def error(image):
         return np.sqrt(np.mean((np.clip(image, 0, 1) - np.clip(true, 0, 1)) ** 2))
@@ -223,15 +222,34 @@ def test_more_samples_are_taken_where_denoised_halves_differ(box):
     pictures = [denoise.CleanPicture(box, box.sensors()[0], noise_in_a_corner, seed=3) for _ in range(2)]
     for picture in pictures:
         picture.take(64)
-    counts = pictures[0]._counts[0] * picture.step
-    np.testing.assert_array_equal(counts, pictures[1]._counts[0] * picture.step)
+    counts = pictures[0]._taken()
+    np.testing.assert_array_equal(pictures[0]._counts, pictures[1]._counts)
     np.testing.assert_array_equal(*(np.array(picture.image()) for picture in pictures))
     assert counts.mean() == pytest.approx(64, rel=0.02) and counts.min() >= 16
-    means = pictures[0]._means()[0][..., 0]
-    noisy = (means != 0.5) | (counts > 2 * np.median(counts))
+    parts, means = pictures[0]._counts[0], pictures[0]._means()[0][..., 0]
+    noisy = denoise._blocks(np.float32((means != 0.5)[..., None]), denoise.FINE)[..., 0] > 0
     assert 0.02 < noisy.mean() < 0.3 and counts[noisy].mean() > 3 * counts[~noisy].mean()
-    n = counts[means != 0.5].sum() / picture.step
-    assert np.average(means[means != 0.5], weights=counts[means != 0.5]) == pytest.approx(0.3, abs=4 * 0.46 / n**0.5)
+    n = parts[means != 0.5].sum()
+    assert np.average(means[means != 0.5], weights=parts[means != 0.5]) == pytest.approx(0.3, abs=4 * 0.46 / n**0.5)
+
+
+def test_halves_of_pixels_are_as_many(box):
+    """However many samples there are, in passes of any size."""
+    pytest.importorskip("mitsuba_oidn")
+
+    def white(scene, points, ray):
+        return mi.Color3f(dr.select(ray.d.x > 2, 0.0, 1.0)), True, []
+
+    picture = denoise.CleanPicture(box, box.sensors()[0], white, seed=3)
+    taken = 0
+    for spp in (5, 1, 2, 3, 7.5):
+        picture._needed = None if spp < 3 else np.random.default_rng(0).random(picture._taken().shape, np.float32) + 0.1
+        picture._add(spp)
+        taken += spp
+        assert picture._taken().mean() == pytest.approx(taken, rel=0.02)
+        assert (denoise._blocks(picture._apart, denoise.FINE) == 0).all()
+    assert (picture._sums[0, ..., 0] == picture._counts[0]).all()
+    assert len(np.unique(picture._taken())) > 3
 
 
 def test_denoising_takes_its_share_of_the_time(box, monkeypatch):

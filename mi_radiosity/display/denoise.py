@@ -17,11 +17,11 @@ from .pixels import AT_ONCE, PixelPoints, camera_rays
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
-LEAST_KNOWN = 8  # samples per pixel, from which on more of them are taken where they are needed
 LEAST_ERROR = 0.1  # of the mean, that every pixel is taken to have
 MOST = 16  # times the mean that a pixel gets of all samples
-TELLING = 0.2  # of the time of samples, that may be spent on where they are needed
+TELLING = 0.3  # of the time of samples, that may be spent on where they are needed
 DEARER = 1.2  # times what others take: samples there, as much of it is gloss and glass
+COARSE = 2  # pixels along each side, that are denoised as one to tell where samples are needed
 SMOOTH = 1.5  # pixels that the error of one is judged by
 LATE = 1.3  # times what is left of the time, which the last image may take
 
@@ -61,7 +61,7 @@ class CleanPicture:
     samples, if not `PixelPoints`.
     """
 
-    step, known = FINE**2, LEAST_KNOWN  # samples per pixel are multiples of the first
+    least = FINE**2  # samples per pixel of the first pass: one of every part
     _pace = 1e-6  # seconds that the cheapest way takes per pixel; as it was last time
 
     def __init__(
@@ -77,34 +77,46 @@ class CleanPicture:
         # radiance of one half of the samples less the other.
         self._sums, self._counts = np.zeros((3, height, width, 3), np.float32), np.zeros((2, height, width), np.int64)
         self._apart = np.zeros((height, width, 3), np.float32)
-        self._each, self._spent = 0, 0.0  # samples of a part in the mean, and the seconds that they took
+        self._spp, self._spent, self._needed = 0, 0.0, None  # samples per pixel in the mean, and seconds they took
 
     def add(self, spp: int) -> int:
-        """Take ``spp`` more samples per pixel in the mean, rounded up to a multiple of ``step``, everywhere; or as many
-        as fit into the same time where they are needed, if it takes little of it to tell. Returns how many."""
-        each, seconds, telling = -(-spp // self.step), self._spent / max(self._each, 1), 2 * self._takes(WAYS[0])
-        where_needed = self._each * self.step >= LEAST_KNOWN and telling <= TELLING * each * seconds
-        if where_needed:
-            each = max(1, int((each - telling / seconds) / DEARER))
-        self._add(each, where_needed)
-        return each * self.step
+        """Take ``spp`` more samples per pixel, everywhere; or as many in the mean where they are needed, once it takes
+        little of the time to tell. The first time fewer, as they take longer there. Returns how many."""
+        each, telling = self._spent / max(self._spp, 1), self._takes(WAYS[0])
+        if self._spp and telling <= TELLING * spp * each:
+            if self._needed is None:
+                spp = max(1, int((spp - telling / each) / DEARER))
+            self._needed = self._where_needed()
+        spp = max(spp, self.least - self._spp)
+        self._add(spp)
+        return spp
 
     def take(self, spp: int) -> None:
-        """All samples of a picture, ``spp`` per pixel: a quarter everywhere, the others where they are needed."""
-        least, most = LEAST_KNOWN // self.step, -(-spp // self.step)
-        while self._each < most:
-            each = max(self._each, -(-most // 4), least)
-            self._add(min(each, most - self._each), self._each >= least)
+        """All samples of a picture, ``spp`` per pixel: a quarter everywhere, the others where they are needed, as seen
+        at first and when half of them are there."""
+        first = max(self.least, spp // 4 // self.least * self.least)
+        self._add(first)
+        for more in ((spp - first) // 2, (spp - first + 1) // 2):
+            if more > 0:
+                self._needed = self._where_needed()
+                self._add(more)
 
-    def _add(self, each, where_needed):
-        """Take so many more samples of every part in the mean."""
-        counts = self._shares(each) if where_needed else np.full_like(self._counts[0], each)
-        start, look = time.perf_counter(), np.clip(FEATURE_SPP // self.step - self._counts[1], 0, counts)
-        before = self._counts[0].copy()
+    def _add(self, spp):
+        """Take so many more samples per pixel in the mean."""
+        start, before = time.perf_counter(), self._counts[0].copy()
+        counts = self._of_parts(self._shares(spp))
+        look = np.clip(FEATURE_SPP // FINE**2 - self._counts[1], 0, counts)
         self._take(look, counts, before, True)
         self._take(counts - look, counts, before, False)
-        self._each += each
+        self._spp += spp
         self._spent += time.perf_counter() - start
+
+    def _of_parts(self, spp):
+        """Samples of parts (int [height, width]) of so many of pixels. Two parts that begin with different halves get
+        one more where parts would get a fraction, by chance: halves of pixels are as many."""
+        chance = np.random.default_rng([self._seed & 0xFFFFFFFF, int(self._spp)]).random(spp.shape)
+        rows = [np.int64(spp / FINE**2 + (row + chance) / FINE) for row in range(FINE)]
+        return np.stack(rows, axis=1).reshape(-1, spp.shape[1]).repeat(FINE, axis=1)
 
     def _take(self, counts, total, before, look):
         """Take ``counts`` more samples of parts, of a pass of ``total``, which had so many ``before`` (int [height,
@@ -150,25 +162,34 @@ class CleanPicture:
             planes += [mi.Color3f(albedo), dr.select(valid, normal, 0)]
         return planes
 
-    def _shares(self, each):
-        """How many of ``each`` samples in the mean every part gets (int [height, width]), for the sum of errors to be
-        least; judged by how far two denoised halves are apart in 8-bit sRGB."""
+    def _where_needed(self):
+        """What samples of pixels (float32 [height, width]) go with, for the sum of errors to be least;
+        judged by how far two denoised halves are apart in 8-bit sRGB."""
         ndimage: Any = optional("scipy.ndimage", "denoising", "denoise")
-        (color, *features), taken = self._means(), self._counts[0, ::FINE, ::FINE]
-        apart = self._apart / self._counts[0, ..., None].astype(np.float32)
-        halves = ([_whole(x) for x in (half, *features)] for half in (color + apart, color - apart))
-        one, other = (srgb(self._denoised(planes, WAYS[0])) for planes in halves)
-        error = ndimage.gaussian_filter(np.nan_to_num(np.mean((one - other) ** 2, axis=2)), SMOOTH)
+        (color, *features), apart = self._means(), self._apart / self._counts[0, ..., None].astype(np.float32)
+        color, apart, *features = (_blocks(x, COARSE * FINE) for x in (color, apart, *features))
+        one, other = (srgb(self._denoised([half, *features], WAYS[0])) for half in (color + apart, color - apart))
+        error = np.nan_to_num(np.mean((one - other) ** 2, axis=2)).repeat(COARSE, axis=0).repeat(COARSE, axis=1)
+        taken = self._taken()
+        error = ndimage.gaussian_filter(error[: taken.shape[0], : taken.shape[1]], SMOOTH)
         # That of well spread samples falls about as the square of how many they are.
-        taken = taken.astype(np.float32)
-        weight = np.cbrt(np.maximum(error, LEAST_ERROR * error.mean() + 1e-9) * taken**2).astype(np.float32)
-        low, high = 0.0, (each + taken.max()) / weight.min()
+        return np.cbrt(np.maximum(error, LEAST_ERROR * error.mean() + 1e-9) * taken**2).astype(np.float32)
+
+    def _shares(self, spp):
+        """How many of ``spp`` more samples in the mean every pixel gets (float32 [height, width])."""
+        taken = self._taken()
+        if self._needed is None:
+            return np.full_like(taken, spp)
+        low, high = 0.0, (spp + taken.max()) / self._needed.min()
         for _ in range(30):
             scale = (low + high) / 2
-            more = np.clip(np.minimum(scale * weight, MOST * (self._each + each)) - taken, 0, None)
-            low, high = (scale, high) if more.mean() < each else (low, scale)
-        dither = np.random.default_rng([self._seed & 0xFFFFFFFF, self._each]).random(more.shape)
-        return np.repeat(np.repeat(np.int64(more + dither), FINE, axis=0), FINE, axis=1)
+            more = np.clip(np.minimum(scale * self._needed, MOST * (self._spp + spp)) - taken, 0, None)
+            low, high = (scale, high) if more.mean() < spp else (low, scale)
+        return more
+
+    def _taken(self):
+        """Samples of pixels (float32 [height, width])."""
+        return FINE**2 * _blocks(np.float32(self._counts[0, ..., None]), FINE)[..., 0]
 
     def _means(self):
         """Means of radiance, albedo and normals (three [height, width, 3])."""
@@ -183,9 +204,9 @@ class CleanPicture:
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
         most = np.inf if seconds is None else LATE * seconds
-        way = self._way(self._each * self.step, lambda way: self._takes(way) <= most)
+        way = self._way(self._spp, lambda way: self._takes(way) <= most)
         start, planes = time.perf_counter(), self._means()
-        clean = self._denoised(planes if way.parts > 1 else map(_whole, planes), way)
+        clean = self._denoised(planes if way.parts > 1 else [_blocks(plane, FINE) for plane in planes], way)
         image = mi.TensorXf(_filtered(clean, self._rfilter, way.parts))
         CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
         return image
@@ -218,9 +239,11 @@ def _sums_of_runs(planes, count):
     return [np.add.reduceat(np.array(plane), start, axis=1).T for plane in planes]
 
 
-def _whole(image):
-    """Means over the parts of pixels, of an image of parts [height, width, 3]."""
-    return sum(image[i::FINE, j::FINE] for i in range(FINE) for j in range(FINE)) / FINE**2
+def _blocks(image, side):
+    """Means over blocks of ``side`` by ``side`` of an image; its last rows and columns count for what lies beyond."""
+    height, width, _ = image.shape
+    image = np.pad(image, ((0, -height % side), (0, -width % side), (0, 0)), mode="edge")
+    return sum(image[i::side, j::side] for i in range(side) for j in range(side)) / side**2
 
 
 def _filtered(image, rfilter, parts):

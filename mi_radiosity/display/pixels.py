@@ -87,7 +87,7 @@ class FilmPicture:
     """A picture on the film of a sensor that takes more and more camera samples of
     ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
 
-    step, known = 1, 0
+    least = 1
 
     def __init__(self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, seed: int) -> None:
         self._scene, self._sensor, self._sample, self._film = scene, sensor, sample, sensor.film()
@@ -126,12 +126,11 @@ class FilmPicture:
 
 
 class Growing(Protocol):
-    """A FilmPicture, or one that is denoised: takes samples in multiples of ``step``, and from so many ``known`` on
-    where they are needed; ``image`` is as good as it gets in so many seconds, and ``preview`` takes little;
-    ``finishing`` is what an image should take of all seconds."""
+    """A FilmPicture, or one that is denoised: takes more and more samples, ``least`` of them at first; ``image`` is as
+    good as it gets in so many seconds, and ``preview`` takes little; ``finishing`` is what an image should take of all
+    seconds."""
 
-    step: int
-    known: int
+    least: int
 
     def add(self, spp: int) -> int: ...
 
@@ -145,11 +144,11 @@ class Growing(Protocol):
 def grow(picture: Growing, seconds: float, show: Callable[[Callable, int], None]) -> int:
     """Take samples until ``seconds`` are over, in passes that grow as far as they fit; returns how many per pixel.
 
-    show(image, samples) is told after every pass; image() is the picture then. At least one step of samples is taken;
-    what a pass takes is judged by those before.
+    show(image, samples) is told after every pass; image() is the picture then. What a pass takes is judged by those
+    before.
     """
     taken: list[tuple[int, float]] = []  # samples and seconds of passes
-    start, done, spp = time.perf_counter(), 0, picture.step
+    start, done, spp = time.perf_counter(), 0, picture.least
     while True:
         before = time.perf_counter()
         spp = picture.add(spp)
@@ -162,14 +161,11 @@ def grow(picture: Growing, seconds: float, show: Callable[[Callable, int], None]
         fits = left / each
         for _ in range(2):  # what the image takes depends on how many samples there will be
             fits = (left - picture.finishing(seconds, done + int(max(fits, 0)))) / each
-        fits = int(fits) // picture.step * picture.step
         if fits < 1:
             return done
         spp = (GROWTH if len(taken) > 1 else 2) * spp
         if fits < GROWTH * spp:  # rather one pass of all that fits than a small one at the end
-            spp = fits
-        if done < picture.known:
-            spp = min(spp, picture.known - done)
+            spp = int(fits)
 
 
 def _costs(taken):

@@ -32,6 +32,7 @@ PATH_SPP = (1, 4, 16, 64, 256, 1024)
 VIEWS = 16
 TIMES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds of the shadings that sample
 OUR_SPP = 16  # camera samples per pixel of our pictures
+OURS = {"path": "ours", "denoised": "ours, denoised"}  # curves of ours, by what they are compared with
 ROOM = 1.5  # times what sampling took, in which `path` may be denoised
 SWEEP = 45  # degrees the camera path turns through
 
@@ -74,9 +75,10 @@ def run_bench(
     """Write bench.json and error_time.png of a scene file into ``output``; returns the results.
 
     Ours is reading, solve and pictures, with kernels warm: for a ladder of budgets, or, in a shading that samples, of
-    times, denoised and not. ``path`` runs at 1…1024 samples per pixel; Open Image Denoise, where it is installed, gets
-    box-filtered pixels or quarters of them, albedo and normals of both, and the film's filter comes afterwards. The
-    camera path turns the first sensor about its place, at half the resolution and a quarter of the samples.
+    times, denoised and not, that goes on until ours is as good as ``path`` or takes as long. ``path`` runs at 1…1024
+    samples per pixel; Open Image Denoise, where it is installed, gets box-filtered pixels or quarters of them, albedo
+    and normals of both, and the film's filter comes afterwards. The camera path turns the first sensor about its place,
+    at half the resolution and a quarter of the samples.
     """
     require_extra()
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
@@ -96,12 +98,12 @@ def run_bench(
         "reference_noise": reference.noise(),
         "tracing": measure(file, elements, rays, runs),
     }
-    attempts = partial(_attempts, model, elements, rays, shading)
+    curves = partial(_curves, model, elements, rays, shading, times)
     one = Views([model.scene.sensors()[view]], [reference.halves()])
-    results["one"] = _curves(attempts(path_spp, times), one, partial(progress, "measuring one view"))
+    results["one"] = curves(path_spp, one, partial(progress, "measuring one view"))
     if views > 1 and (many := _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress)):
         fewer = [s for s in path_spp if s <= max(path_spp[-1] // 4, path_spp[0])]
-        results["many"] = _curves(attempts(fewer, times), many, partial(progress, f"measuring {views} views"))
+        results["many"] = curves(fewer, many, partial(progress, f"measuring {views} views"))
     write(output / "bench.json", json.dumps(results, indent=1) + "\n")
     write(output / "error_time.png", error_against_time(results))
     return results
@@ -110,39 +112,54 @@ def run_bench(
 # ---- Curves ----------------------------------------------------------------------------------------
 
 
-def _attempts(
-    model: Model, elements: int, rays: int, shading: str, path_spp: Sequence[int], times: Sequence[float]
-) -> dict[str, list[Any]]:
-    """By curve: what takes sensors and returns their pictures, and what else is known of them."""
+def _curves(
+    model: Model,
+    elements: int,
+    rays: int,
+    shading: str,
+    times: Sequence[float],
+    path_spp: Sequence[int],
+    views: Views,
+    progress: Callable[[int, int], None],
+) -> dict[str, Any]:
+    """Measured points of every curve, and where the others cross ours."""
     scene, cleans = model.scene, _denoiser_is_there()
     tracers = {"path": path_image} | ({"denoised": _denoised_path} if cleans else {})
-    traced = {curve: [partial(_traced, trace, scene, spp) for spp in path_spp] for curve, trace in tracers.items()}
-    if not SHADERS.find(shading).samples:
+    traced, ours = {}, {}
+    for curve, trace in tracers.items():  # which have one kernel for one sample per pixel and one for more
+        traced[curve] = _points([partial(_traced, trace, scene, spp) for spp in path_spp], 2, views, progress)
+    if SHADERS.find(shading).samples:
+        for curve in traced:
+            attempt = partial(pictures_within, scene, shading, curve == "denoised")
+            ours[OURS[curve]] = _within_times(attempt, times, traced[curve], views, progress)
+    else:
         ladder = [(max(model.patches.count, round(elements * f)), round(rays * f)) for f in LADDER]
-        return {"ours": [partial(_solved, scene, shading, *budget) for budget in ladder]} | traced
-    curves = {"ours": False} | ({"ours, denoised": True} if cleans else {})
-    return {
-        curve: [partial(pictures_within, scene, shading, seconds, clean) for seconds in times]
-        for curve, clean in curves.items()
-    } | traced
+        ours["ours"] = _points([partial(_solved, scene, shading, *budget) for budget in ladder], -1, views, progress)
+    crossings = {curve: crossing(ours.get(OURS[curve], ours["ours"]), points) for curve, points in traced.items()}
+    return ours | traced | {"crossing": crossings}
 
 
-def _curves(attempts: dict[str, list[Callable]], views: Views, progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Measured points of every curve, and where the others cross ours."""
-    done, total = 0, sum(map(len, attempts.values()))
-    curves: dict[str, Any] = {}
-    for curve, tries in attempts.items():
-        # Compiles: `path` has one kernel for one sample per pixel and one for more; ours depend on how elements share.
-        for attempt in tries[: -1 if curve.startswith("ours") else 2]:
-            attempt(views.sensors)
-        curves[curve] = []
-        for attempt in tries:
-            curves[curve].append(_timed(attempt, views))
-            done += 1
-            progress(done, total)
-    ours = {"denoised": curves.get("ours, denoised", curves["ours"])}
-    others = [curve for curve in curves if not curve.startswith("ours")]
-    return curves | {"crossing": {other: crossing(ours.get(other, curves["ours"]), curves[other]) for other in others}}
+def _within_times(attempt, times, other, views, progress):
+    """Our points within ``times``, and twice and twice the last of them until the other's least error is reached, or
+    its longest time."""
+    times = list(times)
+    points = _points([partial(attempt, seconds) for seconds in times], -1, views, progress)
+    least, longest = (pick(p[name] for p in other) for pick, name in ((min, "rmse_a_clean"), (max, "seconds")))
+    while points[-1]["rmse_a_clean"] > least and 2 * times[-1] <= longest:
+        times.append(2 * times[-1])
+        points += _points([partial(attempt, times[-1])], 0, views, progress)
+    return points
+
+
+def _points(attempts, first, views, progress):
+    """Points of a curve, after its ``first`` attempts have compiled what they need."""
+    for attempt in attempts[:first]:
+        attempt(views.sensors)
+    points = []
+    for attempt in attempts:
+        points.append(_timed(attempt, views))
+        progress(len(points), len(attempts))
+    return points
 
 
 def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
@@ -153,7 +170,7 @@ def _timed(attempt: Callable, views: Views) -> dict[str, Any]:
 
 
 def pictures_within(
-    scene: "mi.Scene", shading: str, seconds: float, denoise: bool, sensors: "list[mi.Sensor]"
+    scene: "mi.Scene", shading: str, denoise: bool, seconds: float, sensors: "list[mi.Sensor]"
 ) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Our pictures after so many seconds in all, and what they are made of."""
     start, samples = now(), []

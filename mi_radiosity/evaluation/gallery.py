@@ -80,7 +80,7 @@ def _row(file, work, seconds, spp, denoise, progress):
     halves = reference.halves()
 
     def ours(seconds):
-        return pictures_within(scene, "gather", seconds, denoise, scene.sensors()[:1])
+        return pictures_within(scene, "gather", denoise, seconds, scene.sensors()[:1])
 
     ours(0.5)  # compiles
     start = now()
