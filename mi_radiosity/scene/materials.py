@@ -42,8 +42,8 @@ class Materials:
         self.two_sided = two_sided[faces.shape]
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
         self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
-        self.glossy = dr.any(is_glossy(mi.BSDFPtr([s.bsdf() for s in shapes])))
-        self._traced_faces = owned(mi.UInt32, self.traced[faces.shape])
+        self.glossy = bool(dr.any(is_glossy(mi.BSDFPtr([s.bsdf() for s in shapes])))[0])
+        self.traced_faces = owned(mi.UInt32, self.traced[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))
         plain = ~self.traced[faces.shape]
@@ -90,7 +90,7 @@ class Materials:
         """Do faces have lobes that are traced (Bool [n])?"""
         if not self.traced.any():
             return mi.Bool(False)
-        return dr.gather(mi.UInt32, self._traced_faces, face, active) != 0
+        return dr.gather(mi.UInt32, self.traced_faces, face, active) != 0
 
     def _find_albedos(self, textured):
         """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""
