@@ -101,7 +101,7 @@ POINT_LAMP = {"type": "point", "position": [0, 0.3, 0], "intensity": 2.0}
 def test_rays_that_are_followed_by_recorded_kernels_end_where_others_do():
     """To the bit, in several materials, with waves of any width, and of a second scene after a first."""
     for material in ("rough plastic", "mask"):
-        scene, found = mi.load_dict(box(material)), []
+        scene, found = box(material), []
         for frozen in (True, False):
             with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
                 model = Model(scene)
