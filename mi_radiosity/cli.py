@@ -105,7 +105,7 @@ def _render_arguments(parser):
     within = "as good as it gets in T seconds, solve and pictures together; the file gets better all the time"
     add("--seconds", type=positive_number, metavar="T", help=within)
     shading_argument(parser, "gather")
-    add("--denoise", action="store_true", help="remove noise; samples come in fours (needs mi_radiosity[denoise])")
+    add("--denoise", action="store_true", help="remove noise; of 4 samples at least (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
     add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
     add("--stats", type=Path, metavar="STATS.json", help="write the numbers of the run")

@@ -208,8 +208,8 @@ class Solution:
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         shading: ``gather`` and ``direct`` gather light at every pixel, ``gouraud`` and ``flat`` show what was solved.
-        denoise: remove the noise of the samples, taken in fours, by Open Image Denoise (extra ``denoise``); the picture
-        has 3 channels.
+        denoise: remove the noise of the samples, four per pixel at least and most where they are needed, by Open Image
+        Denoise (extra ``denoise``); the picture has 3 channels.
         seconds: take as many samples as fit, instead of ``spp``; show(image, samples) is told after
         every pass, image() being the picture then.
         Raises RadiosityError if the scene has been edited since it was solved.
