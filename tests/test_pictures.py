@@ -105,10 +105,14 @@ def test_solves_get_what_the_time_allows(box, monkeypatch):
     usual = cost.estimate_cost(model)
     monkeypatch.setattr(cost, "estimate_cost", lambda *_: usual)
     budgets = [cost.afford(model, usual.seconds * share) for share in (0, 0.1, 0.5, 1, 3, 1000)]
-    elements, rays = zip(*budgets)
+    elements, rays, each = zip(*budgets)
     assert list(elements[:3]) == sorted(elements[:3]) and list(rays) == sorted(rays)
-    assert budgets[3] == (None, usual.rays) and elements[4:] == (None, None)  # as by default
+    assert budgets[3][:2] == (None, usual.rays) and elements[4:] == (None, None)  # as by default
+    assert set(each) == {usual.each} and 0 < usual.each * usual.rays < usual.seconds
     assert rays[-1] == cost.MOST * usual.rays and model.patches.count < elements[0] < usual.elements
+    assert cost.affordable(10**6, 1000, 2.0, 0.25e-5) == 800_000  # what is left decides, unless it would be noisy
+    assert cost.affordable(10**6, 1000, -1.0, 1e-5) == 1000 * cost.FEW_RAYS
+    assert cost.affordable(10**4, 1000, 2.0, 0.25e-5) == 10**4
     monkeypatch.undo()
     solution = mr.solve(box, seconds=0.05, rays=10_000)
     assert solution.stats["rays"] == 10_000 and solution.stats["elements"] < usual.elements

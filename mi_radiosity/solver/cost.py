@@ -25,21 +25,22 @@ FOLLOWED = 0.5  # of the rays go on through lobes; the others are lines
 # Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY, PER_LINK = 110e6, 2.5e3, 4e3, 24, 26
 # Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
-WORK, LINES = 2, 320
-# Launches that follow rays, however few, and the seconds of all others.
-LAUNCHES, OTHERS = 32, 0.2
+WORK, LINES = 2, 400
+# Launches that there are however few rays, as launches of rays, and the seconds of all others.
+LAUNCHES, OTHERS = 300, 0.1
 
 
 @dataclass(frozen=True)
 class Cost:
     """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read,
-    ``least`` of them however few rays and elements there are."""
+    ``least`` of them however few rays and elements there are, ``each`` for a ray."""
 
     elements: int
     rays: int
     memory: float
     seconds: float
     least: float
+    each: float
 
 
 def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
@@ -54,15 +55,16 @@ def estimate_cost(model: Model, elements: int | None = None, rays: int | None = 
     line, once = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
     lobes = 0.0
     if cast.lobes:
-        both, once = _seconds(model, cast.follow)
+        both, _ = _seconds(model, cast.follow)
         lobes = max(both - line, 0)
-    traced = rays / (2 if model.lights.may_be_sharp else 1)  # the others are lines from where they end, and short
-    least = OTHERS + LAUNCHES * once
-    seconds = least + line * (WORK * traced + LINES * more) + lobes * FOLLOWED * traced
+    least, each = OTHERS + LAUNCHES * once, WORK * line + FOLLOWED * lobes
+    if model.lights.may_be_sharp:  # half of the rays are lines from where others end, and short
+        each /= 2
+    seconds = least + each * rays + LINES * more * line
     memory = (
         PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE) + PER_LINK * rays
     )
-    return Cost(shared or count, rays, memory, seconds, least)
+    return Cost(shared or count, rays, memory, seconds, least, each)
 
 
 def default_rays(model: Model, elements: int) -> int:
@@ -97,8 +99,9 @@ def top_of(elements: int) -> int:
 
 def afford(
     model: Model, seconds: float, elements: int | None = None, rays: int | None = None
-) -> tuple[int | None, int]:
-    """Elements and rays, where they are not given, that a solve of about so many seconds has; None for the default.
+) -> tuple[int | None, int, float]:
+    """Elements and rays, where they are not given, that a solve of about so many seconds has, None for the default; and
+    the seconds for a ray.
 
     Both go with the time, up to the default elements and MOST times the default rays. Of the seconds that pass whatever
     there is to do, these are charged with half: with all of them nothing would be left where time is short.
@@ -111,7 +114,13 @@ def afford(
         elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
         elements = min(elements, max(rays // FEW_RAYS, ELEMENTS))
         rays = given or max(rays, FEW_RAYS * elements)
-    return elements, rays
+    return elements, rays, usual.each
+
+
+def affordable(rays: int, elements: int, seconds: float, each: float) -> int:
+    """How many of the planned rays fit into the seconds that are left at so many for each; not so few that elements are
+    noisy."""
+    return min(rays, max(FEW_RAYS * elements, int(seconds / max(each, 1e-12))))
 
 
 def _seconds(model, follow):

@@ -15,7 +15,7 @@ from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..transport import PILOT, Gathering, Problem, Transport
-from .cost import FEW_RAYS, afford, default_rays, plan, top_of
+from .cost import FEW_RAYS, afford, affordable, default_rays, plan, top_of
 from .layers import POWERS, powers, solve_layers
 from .refine import Refinement
 from .solution import Solution
@@ -63,9 +63,9 @@ def solve(
 
     model = scene if isinstance(scene, Model) else Model(scene)
     clock.lap("scene")
-    given = elements is not None
+    given, fixed, each = elements is not None, rays is not None, 0.0
     if seconds is not None:
-        elements, rays = afford(model, seconds - clock.total(), elements, rays)
+        elements, rays, each = afford(model, seconds - clock.total(), elements, rays)
     wanted, shared = plan(model, elements, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared, given))
@@ -90,6 +90,8 @@ def solve(
     clock.lap("refine")
 
     rays = int(rays or default_rays(model, count))
+    if seconds is not None and not fixed:  # now that it is known what refinement took
+        rays = affordable(rays, count, seconds - clock.total(), each)
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays: a Flow."""
