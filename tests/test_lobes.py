@@ -3,7 +3,6 @@
 import mi_radiosity as mr
 from mi_radiosity.scene import Model
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -96,17 +95,6 @@ AREA_LAMP = {
     "center": [0, 0.3, 0],
 }
 POINT_LAMP = {"type": "point", "position": [0, 0.3, 0], "intensity": 2.0}
-
-
-def test_rays_that_are_followed_by_recorded_kernels_end_where_others_do():
-    """To the bit, in several materials, with waves of any width, and of a second scene after a first."""
-    for material in ("rough plastic", "mask"):
-        scene, found = box(material), []
-        for frozen in (True, False):
-            with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
-                model = Model(scene)
-                found += [mr.solve(model, elements=400, rays=rays, seed=1).stats["power"] for rays in (3_000, 20_000)]
-        assert found[:2] == found[2:] and found[0] != found[1]
 
 
 def closed_room(lamp, glass=True):
