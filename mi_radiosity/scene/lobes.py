@@ -1,6 +1,8 @@
 """Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
 
+import gc
 from collections.abc import Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -13,10 +15,17 @@ from .hit import Hit, Trail
 
 ROULETTE = 5  # lobes after which a ray may end by chance
 MOST = 64  # lobes after which it ends
+ANY = 1 << 30  # recordings for a scene: one for every pattern of widths
 
 
 class Lobes:
     """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
+
+    def __init__(self) -> None:
+        # A solve follows many short waves of rays: they are traced in less time than the loop is told to Dr.Jit in.
+        self._frozen = dr.freeze(
+            self._follow, state_fn=lambda rays, *_: rays.arrays(), auto_opaque=False, warn_after=ANY
+        )
 
     def follow(
         self,
@@ -36,6 +45,13 @@ class Lobes:
         their own rays. first: uniform numbers that the first lobe is drawn with, three, and then its lines (Float [n]);
         those of well spread rays are well spread, too.
         """
+        if highlights is None and not first:
+            with _garbage_kept():
+                return self._frozen(rays, ray.o, ray.d, number, seed, mode, camera)
+        return self._follow(rays, ray.o, ray.d, number, seed, mode, camera, highlights, first)
+
+    def _follow(self, rays, origin, direction, number, seed, mode, camera, highlights=None, first=()):
+        ray = mi.Ray3f(origin, direction)
         ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
         nought, no = dr.zeros(mi.Float, n), dr.zeros(mi.Bool, n)
@@ -101,6 +117,18 @@ class Lobes:
         )
         ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
         return goes_on, ray, pdf, depth, chance.random, trail
+
+
+@contextmanager
+def _garbage_kept():
+    """Collects no garbage in the body: scenes must not end while Dr.Jit records, or the process does."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 class _Chance:

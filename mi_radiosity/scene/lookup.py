@@ -1,5 +1,7 @@
 """Whose a point is where faces lie in one another: tables on the device."""
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -36,6 +38,10 @@ class Lookup:
         ends = np.cumsum(np.bincount(cell, minlength=first[-1] + finest[-1] ** 2))
         self._starts = owned(mi.UInt32, np.concatenate([[0], ends]))
         self._first, self._finest = (_table(sides, x, 2 * len(corners)) for x in (first, finest))
+
+    def arrays(self) -> list[Any]:
+        """All that `owner` reads."""
+        return [*self._triangles, self._over, self._starts, self._first, self._finest]
 
     @dr.syntax
     def owner(

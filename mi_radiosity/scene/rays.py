@@ -28,6 +28,12 @@ class Rays:
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
 
+    def arrays(self) -> list[Any]:
+        """What rays are traced and named with."""
+        p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
+        named = [self._first_face, self.front, self._patch_of, self._materials.traced_faces, p.emission, p.reflectance]
+        return [self.scene, *named, *overlaps]
+
     def leave(
         self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", s: "mi.Float", t: "mi.Float"
     ) -> "tuple[mi.Point3f, mi.Vector3f]":
