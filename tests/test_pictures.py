@@ -102,13 +102,14 @@ def test_a_denoised_picture_keeps_the_mean(solution):
 def test_solves_get_what_the_time_allows(box, monkeypatch):
     """Elements and rays go with the time, up to a mesh and rays that add no more; what is given stays."""
     model = Model(box)
+    pace = cost.Pace.of(model)
+    monkeypatch.setattr(cost.Pace, "of", lambda *_: pace)
     usual = cost.estimate_cost(model)
-    monkeypatch.setattr(cost, "estimate_cost", lambda *_: usual)
     budgets = [cost.afford(model, usual.seconds * share) for share in (0, 0.1, 0.5, 1, 3, 1000)]
-    elements, rays, each = zip(*budgets)
+    elements, rays, paces = zip(*budgets)
     assert list(elements[:3]) == sorted(elements[:3]) and list(rays) == sorted(rays)
     assert budgets[3][:2] == (None, usual.rays) and elements[4:] == (None, None)  # as by default
-    assert set(each) == {usual.each} and 0 < usual.each * usual.rays < usual.seconds
+    assert set(paces) == {pace} and 0 < pace.ray * usual.rays < usual.seconds
     assert rays[-1] == cost.MOST * usual.rays and model.patches.count < elements[0] < usual.elements
     assert cost.affordable(10**6, 1000, 2.0, 2.0**-18) == 2**19  # what is left decides, unless it would be noisy
     assert cost.affordable(10**6, 1000, -1.0, 1e-5) == 1000 * cost.FEW_RAYS

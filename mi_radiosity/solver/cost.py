@@ -13,11 +13,12 @@ from ..transport.emit import AT_ONCE
 
 ELEMENTS = 19_000  # default mesh: so many leaves more than patches
 RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEMENTS leaves, and for all of them
-SOLVING_SHARE = 0.3  # of the time for solve and pictures: half or twice as much was worse
+SOLVING_SHARE = 0.25  # of the time for solve and pictures: half or twice as much was worse
 TOP = 1 / 4  # of the elements, at least, are there before the oracle is asked, where patches share them
 FEW_RAYS = 30  # per element, below which it is noisy, and shares with others if the time is short
+ENOUGH_RAYS = 60  # per element: as long as there are fewer, rays add more to a picture than elements
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
-FEWEST = 1 / 32  # of the default elements and rays
+SHARES = [MOST * 2 ** (-k / 16) for k in range(113)][::-1]  # of the default elements and rays that are tried
 SHARED = 6 * ELEMENTS  # irradiances by default, where there are more leaves: faces are smaller than light needs them
 PROBES = 1 << 16  # rays that are timed
 RUN = 32  # of them leave from one patch, as most rays of a solve have a neighbour there
@@ -25,46 +26,57 @@ FOLLOWED = 0.5  # of the rays go on through lobes; the others are lines
 # Bytes, measured: of Mitsuba; a patch; an element more than those, with its pairs; a ray in a launch; any ray.
 PROGRAM, PER_PATCH, PER_ELEMENT, PER_RAY, PER_LINK = 110e6, 2.5e3, 4e3, 24, 26
 # Times what tracing a ray takes: all that is done with one; all lines that look at the pairs of an element.
-WORK, LINES = 2, 400
+WORK, LINES = 2.4, 400
 # Launches that there are however few rays, as launches of rays, and the seconds of all others.
 LAUNCHES, OTHERS = 300, 0.1
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read,
-    ``least`` of them however few rays and elements there are, ``each`` for a ray."""
+    """What `solve` would use: leaf elements, rays, bytes of memory at its peak, and seconds after the scene is read."""
 
     elements: int
     rays: int
     memory: float
     seconds: float
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Seconds of what a solve does here: whatever its size, for a ray, and for an element that refinement adds."""
+
     least: float
-    each: float
+    ray: float
+    element: float
+
+    @classmethod
+    def of(cls, model: Model) -> "Pace":
+        """Multiples of what some rays of a Model take that are traced here and now, straight and through lobes."""
+        cast, lobes = model.rays, 0.0
+        line, once = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
+        if cast.lobes:
+            both, _ = _seconds(model, cast.follow)
+            lobes = max(both - line, 0)
+        ray = WORK * line + FOLLOWED * lobes
+        if model.lights.may_be_sharp:  # half of the rays are lines from where others end, and short
+            ray /= 2
+        return cls(OTHERS + LAUNCHES * once, ray, LINES * line)
 
 
 def estimate_cost(model: Model, elements: int | None = None, rays: int | None = None) -> Cost:
-    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two.
-
-    Time is a multiple of what some rays take that are traced here and now, straight and through lobes.
-    """
-    leaves, shared = plan(model, elements, None)
-    count = leaves or model.patches.count
-    rays = rays or default_rays(model, shared or count)
-    more, cast = count - (top_of(shared) if shared else model.patches.count), model.rays
-    line, once = _seconds(model, lambda origin, direction, *_: cast.trace(origin, direction))
-    lobes = 0.0
-    if cast.lobes:
-        both, _ = _seconds(model, cast.follow)
-        lobes = max(both - line, 0)
-    least, each = OTHERS + LAUNCHES * once, WORK * line + FOLLOWED * lobes
-    if model.lights.may_be_sharp:  # half of the rays are lines from where others end, and short
-        each /= 2
-    seconds = least + each * rays + LINES * more * line
+    """What solving a Model costs, by default or with so many elements and rays; good to a factor of two."""
+    pace, (count, more) = Pace.of(model), _sizes(model, elements)
+    rays = rays or default_rays(model, count)
     memory = (
         PROGRAM + PER_PATCH * model.patches.count + PER_ELEMENT * more + PER_RAY * min(rays, AT_ONCE) + PER_LINK * rays
     )
-    return Cost(shared or count, rays, memory, seconds, least, each)
+    return Cost(count, rays, memory, pace.least + pace.ray * rays + pace.element * more)
+
+
+def _sizes(model, elements):
+    """Elements of a mesh, and how many of them refinement adds."""
+    leaves, shared = plan(model, elements, None)
+    return leaves, leaves - (top_of(shared) if shared else model.patches.count)
 
 
 def default_rays(model: Model, elements: int) -> int:
@@ -99,22 +111,32 @@ def top_of(elements: int) -> int:
 
 def afford(
     model: Model, seconds: float, elements: int | None = None, rays: int | None = None
-) -> tuple[int | None, int, float]:
+) -> tuple[int | None, int, Pace]:
     """Elements and rays, where they are not given, that a solve of about so many seconds has, None for the default; and
-    the seconds for a ray.
+    the Pace they were found by.
 
     Both go with the time, up to the default elements and MOST times the default rays. Of the seconds that pass whatever
     there is to do, these are charged with half: with all of them nothing would be left where time is short.
     """
-    usual = estimate_cost(model, elements, rays)
-    least = 0.5 * usual.least
-    share = min(max((seconds - least) / max(usual.seconds - least, 1e-9), FEWEST), MOST)
-    given, rays = rays, rays or round(share * usual.rays)
-    if elements is None and share < 1:
-        elements = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
-        elements = min(elements, max(rays // FEW_RAYS, ELEMENTS))
-        rays = given or max(rays, FEW_RAYS * elements)
-    return elements, rays, usual.each
+    pace, (count, more) = Pace.of(model), _sizes(model, elements)
+    usual = rays or default_rays(model, count)
+    default = pace.ray * usual + pace.element * more
+    work = default * (seconds - 0.5 * pace.least) / (default + 0.5 * pace.least)
+
+    def budget(share):
+        """Elements and rays of a share of the default."""
+        cast = rays or round(share * usual)
+        if elements is not None or share >= 1:
+            return elements, cast
+        fewer = min(model.patches.count, SHARED - ELEMENTS) + round(ELEMENTS * share)
+        fewer = min(fewer, max(cast // ENOUGH_RAYS, ELEMENTS))
+        return fewer, rays or max(cast, FEW_RAYS * fewer)
+
+    def fits(share):
+        fewer, cast = budget(share)
+        return pace.ray * cast + pace.element * _sizes(model, fewer)[1] <= work * (1 + 1e-9)
+
+    return *budget(max(filter(fits, SHARES), default=SHARES[0])), pace
 
 
 def affordable(rays: int, elements: int, seconds: float, each: float) -> int:

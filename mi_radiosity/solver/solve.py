@@ -63,9 +63,9 @@ def solve(
 
     model = scene if isinstance(scene, Model) else Model(scene)
     clock.lap("scene")
-    given, fixed, each = elements is not None, rays is not None, 0.0
+    given, fixed = elements is not None, rays is not None
     if seconds is not None:
-        elements, rays, each = afford(model, seconds - clock.total(), elements, rays)
+        elements, rays, pace = afford(model, seconds - clock.total(), elements, rays)
     wanted, shared = plan(model, elements, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared, given))
@@ -91,7 +91,7 @@ def solve(
 
     rays = int(rays or default_rays(model, count))
     if seconds is not None and not fixed:  # now that it is known what refinement took
-        rays = affordable(rays, count, seconds - clock.total(), each)
+        rays = affordable(rays, count, seconds - clock.total(), pace.ray)
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays: a Flow."""
