@@ -1,6 +1,7 @@
 """Lobes that are not diffuse: every material of Mitsuba against `path`, energy, and what stays as it was."""
 
 import gc
+from weakref import ref
 
 import mi_radiosity as mr
 from mi_radiosity.scene import Model
@@ -131,6 +132,22 @@ def test_scenes_may_become_garbage_while_kernels_are_recorded(monkeypatch):
     finally:
         gc.set_threshold(*thresholds)
     assert gc.isenabled() and not scenes
+
+
+def test_a_scene_ends_with_its_solution():
+    """Nothing of it waits for Python's garbage collection: while a scene is there, Dr.Jit compiles its materials into
+    the kernels of all others."""
+    gc.collect()
+    gc.disable()
+    try:
+        solution = mr.solve(box("mask"), elements=400, rays=3_000)
+        for shading in ("gouraud", "direct", "gather"):
+            solution.render(spp=1, shading=shading)
+        there = [ref(solution), ref(solution.model), ref(solution.model.rays), ref(solution.gatherer)]
+        del solution
+        assert not any(it() for it in there)
+    finally:
+        gc.enable()
 
 
 def closed_room(lamp, glass=True):

@@ -4,6 +4,7 @@ import gc
 from collections.abc import Sequence
 from contextlib import contextmanager
 from typing import Any
+from weakref import ref
 
 import drjit as dr
 import mitsuba as mi
@@ -23,8 +24,12 @@ class Lobes:
 
     def __init__(self) -> None:
         # A solve follows many short waves of rays: they are traced in less time than the loop is told to Dr.Jit in.
+        # Rays are referred to weakly, as Dr.Jit keeps its arguments, and rays these.
         self._frozen = dr.freeze(
-            self._follow, state_fn=lambda rays, *_: rays.arrays(), auto_opaque=False, warn_after=ANY
+            lambda rays, *others: rays().lobes._follow(rays(), *others),
+            state_fn=lambda rays, *_: rays().arrays(),
+            auto_opaque=False,
+            warn_after=ANY,
         )
 
     def follow(
@@ -47,7 +52,7 @@ class Lobes:
         """
         if highlights is None and not first:
             with _garbage_kept():
-                return self._frozen(rays, ray.o, ray.d, number, seed, mode, camera)
+                return self._frozen(ref(rays), ray.o, ray.d, number, seed, mode, camera)
         return self._follow(rays, ray.o, ray.d, number, seed, mode, camera, highlights, first)
 
     def _follow(self, rays, origin, direction, number, seed, mode, camera, highlights=None, first=()):

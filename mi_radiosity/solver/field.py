@@ -29,7 +29,7 @@ class Field:
     """
 
     def __init__(self, solution: Any, irradiance: "mi.Color3f | None" = None) -> None:
-        self._solution, self._elements = solution, solution.elements
+        self._landings, self._elements = solution.landings, solution.elements
         self._rays, self._exposure = solution.model.rays, solution.exposure
         self.flat = solution.direct + solution.indirect if irradiance is None else irradiance
         leaves = self._elements.leaves
@@ -100,11 +100,11 @@ class Field:
     def _without_nodes(self, leaf, x, total, active):
         """H at points x of walled leaves that see no node, and know nothing of some: the leaf's own if light came down
         in sight, nothing if it came down elsewhere, and ``total`` where that is not known (Color3f [n])."""
-        if self._solution.landings.slots == 0:
+        landings = self._landings
+        if landings.slots == 0:
             return total
         slot = dr.gather(mi.UInt32, self._exposure.slot, leaf, active)
         own = dr.gather(mi.Color3f, self.flat, leaf, active)
-        landings = self._solution.landings
         landed = landings.any_on(slot, active)
         seen = landings.in_sight(self._elements, self._rays, leaf, slot, x, landed)
         return dr.select(seen, own, dr.select(landed, 0, total))
@@ -113,10 +113,9 @@ class Field:
 
     def _nodes_away_from_light(self, leaves, lit):
         """Nodes of crossed leaves that no light came down in sight of, a bit for each (UInt32 [leaves])."""
-        dark = dr.zeros(mi.UInt32, dr.width(leaves))
-        if self._solution.landings.slots == 0:
+        dark, landings = dr.zeros(mi.UInt32, dr.width(leaves)), self._landings
+        if landings.slots == 0:
             return dark
-        landings = self._solution.landings
         chosen = dr.compress(landings.any_on(dr.gather(mi.UInt32, self._exposure.slot, leaves), lit))
         if dr.width(chosen) == 0:
             return dark
