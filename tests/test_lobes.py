@@ -113,6 +113,16 @@ def test_rays_that_are_followed_by_recorded_kernels_end_where_others_do():
         assert found[:2] == found[2:] and found[0] != found[1]
 
 
+def test_other_materials_and_shapes_may_be_there():
+    """Those of no scene, too: Dr.Jit has them in its kernels."""
+    others = [mi.load_dict(MATERIALS[material]) for material in ("rough conductor", "plastic")]
+    others += [mi.load_dict({"type": "sphere"}), mi.load_dict({"type": "rectangle", "bsdf": MATERIALS["blend"]})]
+    solution = mr.solve(box("rough glass"), elements=400, rays=3_000)
+    del others
+    again = mr.solve(solution.model, elements=400, rays=3_000)
+    assert solution.stats["power"] == again.stats["power"]
+
+
 def test_scenes_may_become_garbage_while_kernels_are_recorded(monkeypatch):
     """Dr.Jit ends the process when a scene is freed meanwhile; Python looks for garbage at every chance here."""
     scenes, step, thresholds = [box("glass"), box("glass")], Lobes._step, gc.get_threshold()
