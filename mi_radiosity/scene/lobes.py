@@ -35,6 +35,8 @@ class Lobes:
     def follow(
         self,
         rays: Any,
+        met: "mi.PreliminaryIntersection3f",
+        hit: Hit,
         ray: "mi.Ray3f",
         number: "mi.UInt32",
         seed: "mi.UInt32",
@@ -43,60 +45,53 @@ class Lobes:
         highlights: Any = None,
         first: "Sequence[mi.Float]" = (),
     ) -> Trail:
-        """Follow rays of a ``number`` each (UInt32 [n]) to the first diffuse lobe that they draw; returns a Trail.
+        """Follow rays of a ``number`` each (UInt32 [n]), which have ``met`` a lobe, to the first diffuse one that they
+        draw; returns a Trail.
 
-        mode: mi.TransportMode.Importance for rays that carry power, Radiance for those that look for light.
-        camera: the first surface's own light counts, too. highlights: how rough lobes see lamps; without, only by
-        their own rays. first: uniform numbers that the first lobe is drawn with, three, and then its lines (Float [n]);
-        those of well spread rays are well spread, too.
+        hit: the name of what they have met. mode: mi.TransportMode.Importance for rays that carry power, Radiance for
+        those that look for light. camera: the first surface's own light counts, too. highlights: how rough lobes see
+        lamps; without, only by their own rays. first: uniform numbers that the first lobe is drawn with, three, and
+        then its lines (Float [n]); those of well spread rays are well spread, too.
         """
         if highlights is None and not first:
             with _garbage_kept():
-                return self._frozen(ref(rays), ray.o, ray.d, number, seed, mode, camera)
-        return self._follow(rays, ray.o, ray.d, number, seed, mode, camera, highlights, first)
+                return self._frozen(ref(rays), met, hit, ray.o, ray.d, number, seed, mode, camera)
+        return self._follow(rays, met, hit, ray.o, ray.d, number, seed, mode, camera, highlights, first)
 
-    def _follow(self, rays, origin, direction, number, seed, mode, camera, highlights=None, first=()):
-        ray = mi.Ray3f(origin, direction)
-        ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(ray.d)
+    def _follow(self, rays, met, hit, origin, direction, number, seed, mode, camera, highlights=None, first=()):
+        ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(direction)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
-        nought, no = dr.zeros(mi.Float, n), dr.zeros(mi.Bool, n)
-        start = Trail.straight(Hit(no, dr.full(mi.UInt32, NONE, n), nought, nought, no, no), ray.d)
 
-        def step(alive, ray, pdf, depth, random, trail):
+        def step(alive, met, ray, depth, random, trail):
             chance = _Chance(random, depth == 0, first)
-            return self._step(rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, chance, trail)
+            return self._step(rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail)
 
-        state = (~no, mi.Ray3f(ray), nought, dr.zeros(mi.UInt32, n), random, start)
+        start = Trail.straight(hit, direction)
+        state = (dr.full(mi.Bool, True, n), met, mi.Ray3f(origin, direction), dr.zeros(mi.UInt32, n), random, start)
         return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
 
-    def _step(self, rays, ctx, gloss, camera, highlights, alive, ray, pdf, depth, chance, trail):
-        """One more hit, of rays drawn with densities ``pdf`` where lines look for lamps as well, else 0."""
-        prelim = rays.scene.ray_intersect_preliminary(ray, active=alive)
-        hit, before = rays.locate(prelim, ray.d), trail.weight
-        si = prelim.compute_surface_interaction(ray, mi.RayFlags.All, hit.traced)
+    def _step(self, rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail):
+        """Past one more surface that has other lobes than a diffuse one."""
+        before, on_patch = trail.weight, trail.patch != NONE
+        si = met.compute_surface_interaction(ray, mi.RayFlags.All, alive)
         s, st = chance.next_float32(), mi.Point2f(chance.next_float32(), chance.next_float32())
         bsdf = si.bsdf(ray)
-        sample, value = bsdf.sample(ctx, si, s, st, hit.traced)
+        sample, value = bsdf.sample(ctx, si, s, st, alive)
         parts = mi.Float(0), mi.Float(0)
         if rays.glossy:
-            parts = gloss.shares(bsdf, si, hit.traced)
+            parts = gloss.shares(bsdf, si, alive)
             value = gloss.weigh(bsdf, si, sample, value, parts)
-        value = dr.select(hit.traced & dr.isfinite(value), value, 0)
+        value = dr.select(alive & dr.isfinite(value), value, 0)
         drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-        on_patch = hit.patch != NONE
-        coated = hit.traced & drawn & on_patch & (dr.max(value) > 0)
-        on = hit.traced & ~coated
-        rough, share = on & (parts[0] > 0), mi.Float(1)
-        smooth = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
-        if highlights is not None:
-            share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
-            pdf = gloss.light(bsdf, si, sample.wo, parts[0], rough & ~smooth)[1]
+        coated = alive & drawn & on_patch & (dr.max(value) > 0)
+        on = alive & ~coated
+        rough = on & (parts[0] > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
 
-        shines = hit.traced & on_patch & (trail.bounced | camera)
-        glow = before * dr.gather(mi.Color3f, rays.patches.emission, hit.patch, shines) * share
+        shines = alive & on_patch & (trail.bounced | camera)
+        glow = before * dr.gather(mi.Color3f, rays.patches.emission, trail.patch, shines) * trail.share
         if highlights is not None:
-            glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, hit.traced & (parts[0] > 0))
-        rho = dr.gather(mi.Color3f, rays.patches.reflectance, hit.patch, coated)
+            glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, alive & (parts[0] > 0))
+        rho = dr.gather(mi.Color3f, rays.patches.reflectance, trail.patch, coated)
         factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that meets them as received, the others nothing.
         taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
@@ -104,24 +99,28 @@ class Lobes:
         depth += 1
         lives = dr.select(on & (depth > ROULETTE), dr.minimum(dr.max(before * factor), 0.95), 1)
         goes_on = on & (dr.max(before * factor) > 0) & (chance.random.next_float32() < lives) & (depth < MOST)
-        weight = dr.select(on & ~goes_on, 0, before * factor / dr.maximum(lives, 1e-6))
+        ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
+        met = rays.scene.ray_intersect_preliminary(ray, active=goes_on)
+        hit, share = rays.locate(met, ray.d), mi.Float(1)
+        if highlights is not None:  # lines look for lamps as well
+            pdf = gloss.light(bsdf, si, sample.wo, parts[0], rough)[1]
+            share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
         trail = Trail(
-            valid=hit.valid,
-            patch=dr.select(on, NONE, hit.patch),
-            u=hit.u,
-            v=hit.v,
+            valid=hit.valid | ~goes_on,
+            patch=dr.select(goes_on, hit.patch, dr.select(on, NONE, trail.patch)),
+            u=dr.select(goes_on, hit.u, trail.u),
+            v=dr.select(goes_on, hit.v, trail.v),
             direction=ray.d,
-            weight=weight,
+            weight=dr.select(on & ~goes_on, 0, before * factor / dr.maximum(lives, 1e-6)),
             bounced=trail.bounced | on,
-            traced=trail.traced | hit.traced,
+            traced=trail.traced | alive,
             coated=coated,
             taken=trail.taken + taken,
             glow=trail.glow + glow,
-            share=dr.select(alive, share, trail.share),
-            rough=dr.select(trail.bounced, trail.rough, rough & ~smooth),
+            share=dr.select(goes_on, share, trail.share),
+            rough=dr.select(trail.bounced, trail.rough, rough),
         )
-        ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
-        return goes_on, ray, pdf, depth, chance.random, trail
+        return goes_on & hit.traced, met, ray, depth, chance.random, trail
 
 
 @contextmanager

@@ -80,20 +80,21 @@ class Rays:
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
         camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`.
         """
-        hit = self.trace(origin, direction, active)
+        met = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+        hit = self.locate(met, direction)
         if self.lobes is None:
             return hit
         # Those that go on do so side by side, and do not keep the others waiting.
         every = dr.zeros(mi.UInt32, dr.width(direction))
-        states = [mi.Point3f(origin + every), direction, number + every, seed + every, *first]
-        dr.eval(states, hit)
+        states = [met, hit, mi.Point3f(origin + every), direction, number + every, seed + every, *first]
+        dr.eval(states)
         on = dr.compress(hit.traced)
         end = Trail.straight(hit, direction)
         if dr.width(on) == 0:
             return end
-        origin, direction, number, seed, *first = (dr.gather(type(x), x, on) for x in states)
-        mode = mi.TransportMode.Importance if power else mi.TransportMode.Radiance
-        followed = self.lobes.follow(self, mi.Ray3f(origin, direction), number, seed, mode, camera, highlights, first)
+        met, hit, origin, direction, number, seed, *first = (dr.gather(type(x), x, on) for x in states)
+        mode, ray = mi.TransportMode.Importance if power else mi.TransportMode.Radiance, mi.Ray3f(origin, direction)
+        followed = self.lobes.follow(self, met, hit, ray, number, seed, mode, camera, highlights, first)
         dr.eval(followed)
         row = dr.full(mi.UInt32, NONE, dr.width(every))
         dr.scatter(row, dr.arange(mi.UInt32, dr.width(on)), on)
