@@ -69,8 +69,11 @@ class Trail:
             rough=no,
         )
 
-    def replaced(self, row: "mi.UInt32", others: "Trail") -> "Trail":
-        """These ends, but those of ``others`` in the rows given, where there is one (UInt32 [n])."""
+    def replaced(self, rows: "mi.UInt32", others: "Trail") -> "Trail":
+        """These ends, but in some rows (UInt32) those of ``others``."""
+        row = dr.full(mi.UInt32, NONE, dr.width(self.patch))
+        dr.scatter(row, dr.arange(mi.UInt32, dr.width(rows)), rows)
+        dr.eval(others)
         there = row != NONE
         pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
         return Trail(*(dr.select(there, dr.gather(type(b), b, row, there), a) for a, b in pairs))

@@ -16,6 +16,7 @@ from .hit import Hit, Trail
 
 ROULETTE = 5  # lobes after which a ray may end by chance
 MOST = 64  # lobes after which it ends
+MANY = 1 << 16  # rays for which it pays to launch twice
 ANY = 1 << 30  # recordings for a scene: one for every pattern of widths
 
 
@@ -26,7 +27,7 @@ class Lobes:
         # A solve follows many short waves of rays: they are traced in less time than the loop is told to Dr.Jit in.
         # Rays are referred to weakly, as Dr.Jit keeps its arguments, and rays these.
         self._frozen = dr.freeze(
-            lambda rays, *others: rays().lobes._follow(rays(), *others),
+            lambda rays, *others: rays().lobes._past(rays(), *others),
             state_fn=lambda rays, *_: rays().arrays(),
             auto_opaque=False,
             warn_after=ANY,
@@ -53,22 +54,34 @@ class Lobes:
         lamps; without, only by their own rays. first: uniform numbers that the first lobe is drawn with, three, and
         then its lines (Float [n]); those of well spread rays are well spread, too.
         """
-        if highlights is None and not first:
-            with _garbage_kept():
-                return self._frozen(ref(rays), met, hit, ray.o, ray.d, number, seed, mode, camera)
-        return self._follow(rays, met, hit, ray.o, ray.d, number, seed, mode, camera, highlights, first)
-
-    def _follow(self, rays, met, hit, origin, direction, number, seed, mode, camera, highlights=None, first=()):
-        ctx, gloss, n = mi.BSDFContext(mode), Gloss(mode), dr.width(direction)
+        n = dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
+        state = (dr.full(mi.Bool, True, n), met, ray, dr.zeros(mi.UInt32, n), random, Trail.straight(hit, ray.d))
+        past = self._past if highlights is not None or first else self._recorded
+        if n < MANY:
+            return past(rays, state, True, mode, camera, highlights, first)[-1]
+        # Most rays are done after one lobe: the others go on side by side, and do not keep these waiting.
+        alive, *state = past(rays, state, False, mode, camera, highlights, first)
+        dr.eval(alive, state)
+        trail, on = state[-1], dr.compress(alive)
+        if dr.width(on):
+            state = dr.full(mi.Bool, True, dr.width(on)), *(dr.gather(type(x), x, on) for x in state)
+            dr.scatter(trail, past(rays, state, True, mode, camera, highlights)[-1], on)
+        return trail
+
+    def _recorded(self, rays, *others):
+        with _garbage_kept():
+            return self._frozen(ref(rays), *others)
+
+    def _past(self, rays, state, all_of_them, mode, camera, highlights=None, first=()):
+        """The state of rays past one lobe, or all of them."""
+        ctx, gloss = mi.BSDFContext(mode), Gloss(mode)
 
         def step(alive, met, ray, depth, random, trail):
             chance = _Chance(random, depth == 0, first)
             return self._step(rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail)
 
-        start = Trail.straight(hit, direction)
-        state = (dr.full(mi.Bool, True, n), met, mi.Ray3f(origin, direction), dr.zeros(mi.UInt32, n), random, start)
-        return dr.while_loop(state, lambda alive, *_: alive, step)[-1]
+        return dr.while_loop(state, lambda alive, *_: alive, step) if all_of_them else step(*state)
 
     def _step(self, rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail):
         """Past one more surface that has other lobes than a diffuse one."""

@@ -95,10 +95,7 @@ class Rays:
         met, hit, origin, direction, number, seed, *first = (dr.gather(type(x), x, on) for x in states)
         mode, ray = mi.TransportMode.Importance if power else mi.TransportMode.Radiance, mi.Ray3f(origin, direction)
         followed = self.lobes.follow(self, met, hit, ray, number, seed, mode, camera, highlights, first)
-        dr.eval(followed)
-        row = dr.full(mi.UInt32, NONE, dr.width(every))
-        dr.scatter(row, dr.arange(mi.UInt32, dr.width(on)), on)
-        return end.replaced(row, followed)
+        return end.replaced(on, followed)
 
     def on_top(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Bool":
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""
