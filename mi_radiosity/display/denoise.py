@@ -155,7 +155,7 @@ class CleanPicture:
         radiance, _, _ = self._sample(self._scene, points, ray)
         planes = [mi.Color3f(radiance * weight)]
         if look:
-            si = self._scene.ray_intersect(ray)
+            si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
             valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
             albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
             albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)

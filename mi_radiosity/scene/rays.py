@@ -80,7 +80,7 @@ class Rays:
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
         camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`.
         """
-        met = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+        met = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=camera, active=active)
         hit = self.locate(met, direction)
         if self.lobes is None:
             return hit
