@@ -181,10 +181,11 @@ def test_filtered_parts_are_pixels_in_their_place(parts):
     assert denoise._filtered(image, mi.load_dict({"type": "box"}), parts) == pytest.approx(mean)
 
 
-def test_denoising_parts_of_pixels_keeps_edges(box, solution):
+def test_denoising_parts_of_pixels_keeps_edges(box, solution, monkeypatch):
     """Beside `path` under the film's own filter the picture is better than if whole pixels were denoised; and every
     pixel has as many samples as were asked for."""
     pytest.importorskip("mitsuba_oidn")
+    monkeypatch.setattr(denoise, "APART", 1)
     true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(8)], axis=0)[..., :3]
     integrator = mi.load_dict({"type": "radiosity"})
     integrator.show(solution, "gather")
@@ -338,7 +339,7 @@ def test_first_lobes_are_as_well_spread_as_camera_rays(monkeypatch):
         return images.var(axis=0, ddof=1), images.mean(axis=(1, 2))
 
     spread, mean = variance()
-    monkeypatch.setattr(Lobes, "follow", lambda self, *args, first=(): follow(self, *args[:7]))
+    monkeypatch.setattr(Lobes, "follow", lambda self, *args, first=(): follow(self, *args[:9]))
     independent, same = variance()
     freedom = [7 * np.sum(v) ** 2 / np.sum(v**2) for v in (independent, spread)]  # Satterthwaite's
     assert stats.f.sf(independent.mean() / spread.mean(), *freedom) < 1e-4

@@ -17,6 +17,7 @@ from .pixels import AT_ONCE, PixelPoints, camera_rays
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
+APART = 1 << 20  # samples without them that are worth a launch of their own
 LEAST_ERROR = 0.1  # of the mean, that every pixel is taken to have
 MOST = 16  # times the mean that a pixel gets of all samples
 TELLING = 0.3  # of the time of samples, that may be spent on where they are needed
@@ -106,6 +107,8 @@ class CleanPicture:
         start, before = time.perf_counter(), self._counts[0].copy()
         counts = self._of_parts(self._shares(spp))
         look = np.clip(FEATURE_SPP // FINE**2 - self._counts[1], 0, counts)
+        if look.any() and (counts - look).sum() < APART:
+            look = counts
         self._take(look, counts, before, True)
         self._take(counts - look, counts, before, False)
         self._spp += spp
