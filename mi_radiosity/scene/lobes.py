@@ -57,31 +57,29 @@ class Lobes:
         n = dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
         state = (dr.full(mi.Bool, True, n), met, ray, dr.zeros(mi.UInt32, n), random, Trail.straight(hit, ray.d))
-        past = self._past if highlights is not None or first else self._recorded
+        if highlights is None and not first:
+            with _garbage_kept():
+                return self._frozen(ref(rays), state, mode, camera)[-1]
         if n < MANY:
-            return past(rays, state, True, mode, camera, highlights, first)[-1]
+            return self._past(rays, state, mode, camera, highlights, first)[-1]
         # Most rays are done after one lobe: the others go on side by side, and do not keep these waiting.
-        alive, *state = past(rays, state, False, mode, camera, highlights, first)
+        alive, *state = self._past(rays, state, mode, camera, highlights, first, only_one=True)
         dr.eval(alive, state)
         trail, on = state[-1], dr.compress(alive)
         if dr.width(on):
             state = dr.full(mi.Bool, True, dr.width(on)), *(dr.gather(type(x), x, on) for x in state)
-            dr.scatter(trail, past(rays, state, True, mode, camera, highlights)[-1], on)
+            dr.scatter(trail, self._past(rays, state, mode, False, highlights)[-1], on)
         return trail
 
-    def _recorded(self, rays, *others):
-        with _garbage_kept():
-            return self._frozen(ref(rays), *others)
-
-    def _past(self, rays, state, all_of_them, mode, camera, highlights=None, first=()):
-        """The state of rays past one lobe, or all of them."""
+    def _past(self, rays, state, mode, camera, highlights=None, first=(), only_one=False):
+        """The state of rays past all lobes, or past one."""
         ctx, gloss = mi.BSDFContext(mode), Gloss(mode)
 
         def step(alive, met, ray, depth, random, trail):
             chance = _Chance(random, depth == 0, first)
             return self._step(rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail)
 
-        return dr.while_loop(state, lambda alive, *_: alive, step) if all_of_them else step(*state)
+        return step(*state) if only_one else dr.while_loop(state, lambda alive, *_: alive, step)
 
     def _step(self, rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail):
         """Past one more surface that has other lobes than a diffuse one."""
