@@ -16,7 +16,6 @@ from .hit import Hit, Trail
 
 ROULETTE = 5  # lobes after which a ray may end by chance
 MOST = 64  # lobes after which it ends
-MANY = 1 << 16  # rays for which it pays to launch twice
 ANY = 1 << 30  # recordings for a scene: one for every pattern of widths
 
 
@@ -60,8 +59,6 @@ class Lobes:
         if highlights is None and not first:
             with _garbage_kept():
                 return self._frozen(ref(rays), state, mode, camera)[-1]
-        if n < MANY:
-            return self._past(rays, state, mode, camera, highlights, first)[-1]
         # Most rays are done after one lobe: the others go on side by side, and do not keep these waiting.
         alive, *state = self._past(rays, state, mode, camera, highlights, first, only_one=True)
         dr.eval(alive, state)
