@@ -121,7 +121,7 @@ def _later_kernels(scene: "mi.Scene", elements: int, least: int, rays: int) -> i
 class Recorder(Rays):
     """Keeps the rays it casts by what they are for: ``power``, ``oracle``, or nothing a solve is charged for.
 
-    Rays are those that `trace` follows and the lines of the kernel F. The only ones who ask for F between
+    Rays are those traced to what they `meet`, and the lines of the kernel F. The only ones who ask for F between
     patches during a solve are oracles.
     """
 
@@ -131,11 +131,11 @@ class Recorder(Rays):
         self.counts = dict.fromkeys(self.queries, 0)
         self.carrying, self._line_for = False, ""
 
-    def trace(self, origin, direction, active=True):
+    def meet(self, origin, direction, active=True, coherent=False):
         if self.carrying:
             ray = mi.Ray3f(origin, direction)
             self._keep("power", ray, active, lambda a: _hit(self.scene.ray_intersect_preliminary(ray, active=a)))
-        return super().trace(origin, direction, active)
+        return super().meet(origin, direction, active, coherent)
 
     def kernel(self, *points):
         self._line_for = "oracle"

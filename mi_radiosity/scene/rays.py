@@ -45,8 +45,17 @@ class Rays:
 
     def trace(self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True) -> Hit:
         """Nearest hits of rays (Point3f, Vector3f [rays])."""
-        prelim = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
-        return self.locate(prelim, direction)
+        return self.locate(self.meet(origin, direction, active), direction)
+
+    def meet(
+        self,
+        origin: "mi.Point3f",
+        direction: "mi.Vector3f",
+        active: "mi.Bool | bool" = True,
+        coherent: bool = False,
+    ) -> "mi.PreliminaryIntersection3f":
+        """Nearest intersections of rays (Point3f, Vector3f [rays])."""
+        return self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)
 
     def locate(self, prelim: "mi.PreliminaryIntersection3f", direction: "mi.Vector3f") -> Hit:
         """Name the patches that intersections lie on."""
@@ -80,7 +89,7 @@ class Rays:
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
         camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`.
         """
-        met = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=camera, active=active)
+        met = self.meet(origin, direction, active, coherent=camera)
         hit = self.locate(met, direction)
         if self.lobes is None:
             return hit
