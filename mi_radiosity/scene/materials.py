@@ -30,7 +30,7 @@ AT_ONCE = 1 << 22  # samples in one launch
 class Materials:
     """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
     ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]; ``glossy``: are
-    there rough lobes?
+    there rough lobes? ``bsdfs`` [shapes]: Mitsuba's.
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -42,7 +42,8 @@ class Materials:
         self.two_sided = two_sided[faces.shape]
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
         self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
-        self.glossy = bool(dr.any(is_glossy(mi.BSDFPtr([s.bsdf() for s in shapes])))[0])
+        self.bsdfs = mi.BSDFPtr([s.bsdf() for s in shapes])
+        self.glossy = bool(dr.any(is_glossy(self.bsdfs))[0])
         self.traced_faces = owned(mi.UInt32, self.traced[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))

@@ -27,14 +27,13 @@ class Rays:
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
-        # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
-        self._called = self.scene.shapes_dr(), mi.BSDFPtr([shape.bsdf() for shape in self.scene.shapes()])
 
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
         p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
         named = [self._first_face, self.front, self._patch_of, self._materials.traced_faces, p.emission, p.reflectance]
-        return [self.scene, *self._called, *named, *overlaps]
+        # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
+        return [self.scene, self.scene.shapes_dr(), self._materials.bsdfs, *named, *overlaps]
 
     def leave(
         self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", s: "mi.Float", t: "mi.Float"
