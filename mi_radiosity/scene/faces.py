@@ -11,6 +11,7 @@ from ..core.arrays import owned, row_keys
 from ..core.errors import RadiosityError
 from .tessellate import tracing_scene
 
+RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
 FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 
 
@@ -20,9 +21,10 @@ class Faces:
     ``tracing``: the scene itself, or one in which every shape is a mesh; ``parts``: what its shapes stand for. Arrays
     over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
     ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
-    corners), ``rank`` (its place in an order that only geometry decides) and ``order`` (the faces in it); ``centre``
-    [3] of the scene; ``smooth``: some shapes have vertex normals; ``vertex`` [faces, 3]: numbers of their corners, the
-    same where positions are the same to the bit.
+    corners), ``rank`` (its place in an order that only geometry decides) and ``order`` (the faces in it); ``vertex``
+    [faces, 3]: numbers of their corners, the same where positions are the same to the bit. ``centre`` [3] of the scene;
+    ``lift``: by how much rays must start off a surface, and what lies in one plane, m; ``smooth``: some shapes have
+    vertex normals.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -46,7 +48,9 @@ class Faces:
             raise RadiosityError("the scene has no faces: nothing can be lit")
         self.refuse(~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh")
         self.corners = corners
-        self.centre = (corners.min(axis=(0, 1)) + corners.max(axis=(0, 1))) / 2
+        low, high = (which(axis=0) for which in (corners.reshape(-1, 3).min, corners.reshape(-1, 3).max))
+        self.centre = (low + high) / 2
+        self.lift = RAY_OFFSET * max(-low.min(), high.max(), np.finfo(np.float32).tiny)
         self.order = _canonical_order(corners)
         self.rank = np.empty_like(self.order)
         self.rank[self.order] = np.arange(len(corners))

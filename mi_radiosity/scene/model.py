@@ -14,7 +14,7 @@ from .faces import Faces
 from .lights import Lights
 from .materials import Materials, require_supported
 from .overlap import find_overlaps
-from .patches import lift_of, make_patches
+from .patches import make_patches
 from .rays import Rays
 from .reach import reached
 from .state import Parameters, State
@@ -41,12 +41,13 @@ class Model:
         self._named = self._parameters()  # as they are now
         overlaps = self._find_overlaps()
         self.unreached = 0
-        patches = self._patches(self._sides(self._candidate & ~overlaps.covered) if sides is None else sides)
+        wanted = self._sides(self._candidate & ~overlaps.covered) if sides is None else sides
+        patches = make_patches(self.faces, self.materials, self.lights, _some(wanted))
         if sides is None and lit:
             found = reached(self._rays(patches, overlaps), self.lights)
             self.unreached = int((~found).sum())
             if self.unreached:
-                patches = self._patches(patches.sides[found])
+                patches = patches.only(_some(np.flatnonzero(found)))
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
         self.rays = self._rays(patches, kept)
@@ -77,15 +78,8 @@ class Model:
         self._candidate = there & lobe if self.lights.required else there
         exitance = self.lights.exitance.sum(axis=1)
         return find_overlaps(
-            f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, lift_of(f)
+            f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, f.lift
         )
-
-    def _patches(self, sides):
-        if not len(sides):
-            raise RadiosityError(
-                "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
-            )
-        return make_patches(self.faces, self.materials, self.lights, sides)
 
     def _rays(self, patches, overlaps):
         return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
@@ -127,3 +121,12 @@ class Model:
             if self.materials.traced[number]:
                 found += [str(first[number]).encode(), Parameters(f.parts[number].shape.bsdf())]
         return found
+
+
+def _some(sides):
+    """Sides to make patches of: there must be any."""
+    if len(sides):
+        return sides
+    raise RadiosityError(
+        "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
+    )

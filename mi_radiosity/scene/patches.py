@@ -1,6 +1,6 @@
 """The table of patches: oriented sides of faces."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +11,6 @@ from .faces import Faces
 from .lights import Lights
 from .materials import Materials
 
-RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
 CORNERS = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
 
 
@@ -49,12 +48,27 @@ class Patches:
         """Points of patches, lifted off them by the rounding of rays (Point3f [n])."""
         return mi.Point3f(self.point(patch, u, v) + dr.gather(mi.Vector3f, self.normal, patch) * self.lift)
 
+    def only(self, rows: np.ndarray) -> "Patches":
+        """Some of them (int [patches])."""
+        chosen = owned(mi.UInt32, rows)
+
+        def pick(column):
+            return dr.gather(type(column), column, chosen)
+
+        columns = ("face", "back", "p0", "e1", "e2", "normal", "area", "reflectance", "emission")
+        picked: dict = {name: pick(getattr(self, name)) for name in columns}
+        picked["corners"] = [pick(corner) for corner in self.corners]
+        dr.eval(picked)
+        return replace(
+            self, count=len(rows), sides=self.sides[rows], total_area=_total(np.array(picked["area"])), **picked
+        )
+
 
 def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.ndarray) -> Patches:
     """Patches of the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
     face, back = faces.order[sides // 2], sides % 2
     sign, emits = np.where(back == 1, -1.0, 1.0)[:, None], (back == 0)[:, None]
-    corners = faces.corners[face]
+    corners, area = faces.corners[face], faces.area[face].astype(np.float32)
     return Patches(
         count=len(sides),
         sides=sides,
@@ -64,19 +78,18 @@ def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.n
         e1=owned_vectors(mi.Vector3f, faces.e1[face]),
         e2=owned_vectors(mi.Vector3f, faces.e2[face]),
         normal=owned_vectors(mi.Vector3f, faces.normal[face] * sign),
-        area=owned(mi.Float, faces.area[face]),
+        area=owned(mi.Float, area),
         reflectance=owned_vectors(mi.Color3f, materials.rho[back, face]),
         emission=owned_vectors(mi.Color3f, np.where(emits, lights.exitance[face], 0)),
-        total_area=float(faces.area[face].sum()),
+        total_area=_total(area),
         origin=mi.Point3f(*(dr.opaque(mi.Float, c) for c in faces.centre)),
-        lift=dr.opaque(mi.Float, lift_of(faces)),
+        lift=dr.opaque(mi.Float, faces.lift),
         corners=[owned_vectors(mi.Point3f, corners[:, k].astype(np.float32)) for k in range(3)],
     )
 
 
-def lift_of(faces: Faces) -> float:
-    """By how much rays must start off a surface, and what lies in one plane, m."""
-    return RAY_OFFSET * max(np.abs(faces.corners).max(), np.finfo(np.float32).tiny)
+def _total(area):
+    return float(area.sum(dtype=np.float64))
 
 
 def patch_table(faces: Faces, patches: Patches) -> "mi.UInt32":

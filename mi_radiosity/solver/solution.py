@@ -24,7 +24,6 @@ from ..mesh.subdivision import NODES
 from ..scene import Model
 from ..scene.lamps import Lamps
 from ..scene.nearest import nearest_face
-from ..scene.patches import lift_of
 from ..transport import Gatherer, ViewFactors, view_factors
 from ..transport.landings import Landings
 from ..transport.probe import probe
@@ -140,7 +139,7 @@ class Solution:
         (Bool [n])"""
         model, rays = self.model, self.model.rays
         towards = np.zeros_like(points) if normals is None else normals
-        face, u, v, near = nearest_face(model.faces, points, towards, lift_of(model.faces))
+        face, u, v, near = nearest_face(model.faces, points, towards, model.faces.lift)
         facing = dr.dot(owned_vectors(mi.Vector3f, towards), dr.gather(mi.Vector3f, rays.front, face))
         front, back = (rays.side(face, dr.full(mi.Bool, side, len(points)), u, v, near) for side in (False, True))
         return dr.select(front.patch == NONE if normals is None else facing < 0, back, front), near
