@@ -51,7 +51,8 @@ def require_denoiser() -> Any:
 
 
 class CleanPicture:
-    """A picture [height, width, 3] of ``sample(scene, points, ray)`` that takes more and more samples, denoised.
+    """A picture [height, width, 3] of ``sample(scene, points, ray, met)`` that takes more and more samples, denoised;
+    ``met``: what rays meet first, where that is known.
 
     Samples are averaged over quarters of pixels, as the denoiser needs numbers that are independent, with albedo and
     normals of the surfaces seen. The film's own filter is applied afterwards, to quarters, if there are enough samples
@@ -155,10 +156,11 @@ class CleanPicture:
 
     def _planes(self, points, ray, weight, look):
         """Radiance of samples, and if there is a ``look``, albedo and normal (Color3f [n])."""
-        radiance, _, _ = self._sample(self._scene, points, ray)
+        met = self._scene.ray_intersect_preliminary(ray, coherent=True) if look else None
+        radiance, _, _ = self._sample(self._scene, points, ray, met=met)
         planes = [mi.Color3f(radiance * weight)]
         if look:
-            si = self._scene.ray_intersect(ray, mi.RayFlags.All, True)
+            si = met.compute_surface_interaction(ray, mi.RayFlags.All)
             valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
             albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
             albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)

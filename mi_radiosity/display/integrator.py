@@ -80,7 +80,10 @@ def _integrator_class():
                 return self.render(scene, sensor, seed=seed, spp=spp)
             start = time.perf_counter()
             self.prepare(scene)
-            picture = (CleanPicture if denoise else FilmPicture)(scene, sensor, self._sample, seed)
+            if denoise:
+                picture = CleanPicture(self.solution.model.rays.scene, sensor, self._sample, seed)
+            else:
+                picture = FilmPicture(scene, sensor, self._sample, seed)
             if seconds is None:
                 picture.take(spp)
             else:
@@ -106,18 +109,20 @@ def _integrator_class():
             self.prepare(scene)
             return self._sample(scene, sampler, ray, active)
 
-        def _sample(self, scene, sampler, ray, active=True):
-            """What `sample` gives of a scene that is prepared."""
+        def _sample(self, scene, sampler, ray, active=True, met=None):
+            """What `sample` gives of a scene that is prepared; ``met``: what rays meet first, if that is known."""
             solution = self.solution
             model, rays = solution.model, solution.model.rays
+            if met is None:
+                met = rays.seen(ray, active)
             if rays.lobes is None:
-                hit = rays.locate(rays.scene.ray_intersect_preliminary(ray, coherent=True, active=active), ray.d)
+                hit = rays.locate(met, ray.d)
             else:
                 number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
                 lamps = solution.gatherer.highlights
                 # The first lobe, and a line to a lamp from there, are as well spread as the ray is.
                 first = sampler.next_1d(), *sampler.next_2d(), *sampler.next_2d(), sampler.next_1d()
-                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, active=active, highlights=lamps, first=first)
+                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, highlights=lamps, first=first, met=met)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)

@@ -223,7 +223,7 @@ def _denoised_path(scene, sensor, spp):
 
     start = now()
     picture = CleanPicture(
-        scene, sensor, lambda scene, sampler, ray: integrator.sample(scene, sampler, ray), seed=spp, draw=draw
+        scene, sensor, lambda scene, sampler, ray, met: integrator.sample(scene, sampler, ray), seed=spp, draw=draw
     )
     picture.add(spp)  # all at once, so everywhere alike
     return np.array(picture.image(picture.finishing(ROOM * (now() - start), spp)))

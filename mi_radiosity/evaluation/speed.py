@@ -131,11 +131,11 @@ class Recorder(Rays):
         self.counts = dict.fromkeys(self.queries, 0)
         self.carrying, self._line_for = False, ""
 
-    def meet(self, origin, direction, active=True, coherent=False):
+    def meet(self, origin, direction, active=True):
         if self.carrying:
             ray = mi.Ray3f(origin, direction)
             self._keep("power", ray, active, lambda a: _hit(self.scene.ray_intersect_preliminary(ray, active=a)))
-        return super().meet(origin, direction, active, coherent)
+        return super().meet(origin, direction, active)
 
     def kernel(self, *points):
         self._line_for = "oracle"

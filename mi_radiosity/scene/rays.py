@@ -47,14 +47,14 @@ class Rays:
         return self.locate(self.meet(origin, direction, active), direction)
 
     def meet(
-        self,
-        origin: "mi.Point3f",
-        direction: "mi.Vector3f",
-        active: "mi.Bool | bool" = True,
-        coherent: bool = False,
+        self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
     ) -> "mi.PreliminaryIntersection3f":
         """Nearest intersections of rays (Point3f, Vector3f [rays])."""
-        return self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=coherent, active=active)
+        return self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
+
+    def seen(self, ray: "mi.Ray3f", active: "mi.Bool | bool" = True) -> "mi.PreliminaryIntersection3f":
+        """Nearest intersections of a camera's rays, which keep together and may have an end."""
+        return self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
 
     def locate(self, prelim: "mi.PreliminaryIntersection3f", direction: "mi.Vector3f") -> Hit:
         """Name the patches that intersections lie on."""
@@ -82,13 +82,16 @@ class Rays:
         active: "mi.Bool | bool" = True,
         highlights: Any = None,
         first: "Sequence[mi.Float]" = (),
+        met: "mi.PreliminaryIntersection3f | None" = None,
     ) -> Hit | Trail:
         """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
 
         number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
-        camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`.
+        camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`. met: the
+        first intersections, if they are known.
         """
-        met = self.meet(origin, direction, active, coherent=camera)
+        if met is None:
+            met = self.meet(origin, direction, active)
         hit = self.locate(met, direction)
         if self.lobes is None:
             return hit
