@@ -216,7 +216,7 @@ def test_camera_rays_are_mitsubas():
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-6)
 
 
-def noise_in_a_corner(scene, points, ray):
+def noise_in_a_corner(scene, points, ray, met):
     """Black or white, by chance, in the lower left of the picture; grey elsewhere."""
     corner = (ray.d.x > 0.15) & (ray.d.y < -0.15)
     return mi.Color3f(dr.select(corner, dr.select(points.next_1d() < 0.3, 1.0, 0.0), 0.5)), True, []
@@ -243,7 +243,7 @@ def test_halves_of_pixels_are_as_many(box):
     """However many samples there are, in passes of any size."""
     pytest.importorskip("mitsuba_oidn")
 
-    def white(scene, points, ray):
+    def white(scene, points, ray, met):
         return mi.Color3f(dr.select(ray.d.x > 2, 0.0, 1.0)), True, []
 
     picture = denoise.CleanPicture(box, box.sensors()[0], white, seed=3)
