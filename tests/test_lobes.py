@@ -85,6 +85,21 @@ def test_mirrors_and_glass_make_no_patches():
     assert plain.patches.count == glass.patches.count - 22
 
 
+@pytest.mark.parametrize("material", ["null", "two sides"])
+def test_cameras_see_no_farther_than_they_are_told(material):
+    """A camera's far clip ends its rays in front of the box, whatever the box is made of; its near clip does not."""
+    parts = mi.cornell_box()
+    parts["large-box"]["bsdf"] = MATERIALS[material]
+    sensor = {"type": "perspective", "fov": 39, "to_world": parts["sensor"]["to_world"]}
+    sensor |= {"film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}}
+    solution = mr.solve(mi.load_dict(parts), elements=500, rays=20_000)
+    near, far = (
+        np.array(solution.render(mi.load_dict(sensor | {"near_clip": 0.1, "far_clip": clip}), spp=4, shading="gather"))
+        for clip in (2, 100)
+    )
+    assert not near[..., :3].any() and far[..., :3].any()
+
+
 def test_diffuse_scenes_are_not_followed(cornell):
     """Not a kernel more than before: no lobe is ever asked for."""
     assert Model(cornell).rays.lobes is None
