@@ -80,7 +80,7 @@ def _integrator_class():
                 return self.render(scene, sensor, seed=seed, spp=spp)
             start = time.perf_counter()
             self.prepare(scene)
-            if denoise:
+            if denoise:  # which looks where rays meet what they are traced in
                 picture = CleanPicture(self.solution.model.rays.scene, sensor, self._sample, seed)
             else:
                 picture = FilmPicture(scene, sensor, self._sample, seed)

@@ -55,7 +55,7 @@ def plane_grid(model: Model, text: str, spacing: float | None = None) -> Grid:
         sign, axis, height = found[1], found[2], float(found[3])  # type: ignore[index]
     except (TypeError, ValueError):
         raise RadiosityError(f"'{text}' is no plane: write z=0.8, or -z=0.8 for one that faces down") from None
-    low, high = model.faces.corners.min(axis=(0, 1)), model.faces.corners.max(axis=(0, 1))
+    low, high = model.faces.low, model.faces.high
     k, i, j = ("xyz".index(name) for name in (axis, *AXES[axis]))
     if not low[k] <= height <= high[k]:
         raise RadiosityError(

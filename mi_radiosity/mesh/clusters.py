@@ -94,7 +94,7 @@ def cluster_labels(
     """
     face, back = np.array(patches.face), np.array(patches.back).astype(np.int64)
     corners = faces.corners[face]
-    centre = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3 - faces.corners.min(axis=(0, 1))
+    centre = (corners[:, 0] + corners[:, 1] + corners[:, 2]) / 3 - faces.low
     bins = np.round(faces.normal[face] * np.where(back, -1, 1)[:, None] * BINS).astype(np.int64)
     kind = row_keys(np.column_stack([faces.shape[face], back, bins]))
     a, b = _neighbours(faces, face, back, ~crossed)

@@ -22,9 +22,9 @@ class Faces:
     over faces: ``corners`` [faces, 3, 3] m, ``e1``, ``e2``, ``normal`` (unit, towards the shading side), ``area`` m²,
     ``shape`` (its number in ``tracing``), ``degenerate``, ``flipped`` (the shading side is not that of the order of
     corners), ``rank`` (its place in an order that only geometry decides) and ``order`` (the faces in it); ``vertex``
-    [faces, 3]: numbers of their corners, the same where positions are the same to the bit. ``centre`` [3] of the scene;
-    ``lift``: by how much rays must start off a surface, and what lies in one plane, m; ``smooth``: some shapes have
-    vertex normals.
+    [faces, 3]: numbers of their corners, the same where positions are the same to the bit. ``low``, ``high``,
+    ``centre`` [3] of the box around them; ``lift``: by how much rays must start off a surface, and what lies in one
+    plane, m; ``smooth``: some shapes have vertex normals.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -48,9 +48,9 @@ class Faces:
             raise RadiosityError("the scene has no faces: nothing can be lit")
         self.refuse(~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh")
         self.corners = corners
-        low, high = (which(axis=0) for which in (corners.reshape(-1, 3).min, corners.reshape(-1, 3).max))
-        self.centre = (low + high) / 2
-        self.lift = RAY_OFFSET * max(-low.min(), high.max(), np.finfo(np.float32).tiny)
+        self.low, self.high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        self.centre = (self.low + self.high) / 2
+        self.lift = RAY_OFFSET * max(-self.low.min(), self.high.max(), np.finfo(np.float32).tiny)
         self.order = _canonical_order(corners)
         self.rank = np.empty_like(self.order)
         self.rank[self.order] = np.arange(len(corners))

@@ -300,8 +300,7 @@ class Lights:
 
     def _free(self):
         """Lamps that are no surfaces, in an order that does not depend on Mitsuba's."""
-        scene, corners = self._faces.scene, self._faces.corners.reshape(-1, 3)
-        box = corners.min(axis=0), corners.max(axis=0)
+        scene, box = self._faces.scene, (self._faces.low, self._faces.high)
         kinds = [(emitter, LIGHTS.find(emitter.class_name())) for emitter in scene.emitters()]
         lights = [kind(emitter, scene, *box) for emitter, kind in kinds if not kind.on_surface]
         return sorted(lights, key=lambda light: light.fingerprint())

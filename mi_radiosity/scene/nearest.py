@@ -22,7 +22,7 @@ def nearest_face(
     e1, e2, normal = (owned_vectors(mi.Vector3f, a) for a in (faces.e1, faces.e2, faces.normal))
     x, n = owned_vectors(mi.Point3f, points - faces.centre), owned_vectors(mi.Vector3f, normals)
     u, v, face, least = _search(corners, e1, e2, normal, opaque_index(len(faces)), x, n, dr.opaque(mi.Float, lift))
-    size = faces.corners.max(axis=(0, 1)) - faces.corners.min(axis=(0, 1))
+    size = faces.high - faces.low
     return face, u, v, least <= dr.opaque(mi.Float, REACH**2 * float(size @ size))
 
 

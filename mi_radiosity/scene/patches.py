@@ -1,6 +1,7 @@
 """The table of patches: oriented sides of faces."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -34,7 +35,6 @@ class Patches:
     area: "mi.Float"  # m²
     reflectance: "mi.Color3f"  # ρ, mean over the patch
     emission: "mi.Color3f"  # E = π L_e, W/m²
-    total_area: float  # m²
     origin: "mi.Point3f"
     lift: "mi.Float"  # by which rays start off a surface, m
     corners: list  # three Point3f where the file has them, to the bit
@@ -59,16 +59,19 @@ class Patches:
         picked: dict = {name: pick(getattr(self, name)) for name in columns}
         picked["corners"] = [pick(corner) for corner in self.corners]
         dr.eval(picked)
-        return replace(
-            self, count=len(rows), sides=self.sides[rows], total_area=_total(np.array(picked["area"])), **picked
-        )
+        return replace(self, count=len(rows), sides=self.sides[rows], **picked)
+
+    @cached_property
+    def total_area(self) -> float:
+        """Of all patches, m²."""
+        return float(np.array(self.area).sum(dtype=np.float64))
 
 
 def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.ndarray) -> Patches:
     """Patches of the given sides (int [patches]): 2 · the face's rank + (1 for the back)."""
     face, back = faces.order[sides // 2], sides % 2
     sign, emits = np.where(back == 1, -1.0, 1.0)[:, None], (back == 0)[:, None]
-    corners, area = faces.corners[face], faces.area[face].astype(np.float32)
+    corners = faces.corners[face]
     return Patches(
         count=len(sides),
         sides=sides,
@@ -78,18 +81,13 @@ def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.n
         e1=owned_vectors(mi.Vector3f, faces.e1[face]),
         e2=owned_vectors(mi.Vector3f, faces.e2[face]),
         normal=owned_vectors(mi.Vector3f, faces.normal[face] * sign),
-        area=owned(mi.Float, area),
+        area=owned(mi.Float, faces.area[face]),
         reflectance=owned_vectors(mi.Color3f, materials.rho[back, face]),
         emission=owned_vectors(mi.Color3f, np.where(emits, lights.exitance[face], 0)),
-        total_area=_total(area),
         origin=mi.Point3f(*(dr.opaque(mi.Float, c) for c in faces.centre)),
         lift=dr.opaque(mi.Float, faces.lift),
         corners=[owned_vectors(mi.Point3f, corners[:, k].astype(np.float32)) for k in range(3)],
     )
-
-
-def _total(area):
-    return float(area.sum(dtype=np.float64))
 
 
 def patch_table(faces: Faces, patches: Patches) -> "mi.UInt32":
