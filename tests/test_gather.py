@@ -159,7 +159,7 @@ def test_lamps_are_drawn_as_often_as_their_density_says(most, places, monkeypatc
         for k in range(5)
     }
     solution = mr.solve(scene(floor=rectangle(T().scale(4), bsdf=diffuse()), **lamps), elements=200, rays=20_000)
-    choice, n = LampChoice(solution.model, solution.elements), 100_000
+    choice, n = LampChoice(solution.elements), 100_000
     leaves = np.array(solution.elements.leaves)
     rows = np.stack(
         [

@@ -15,7 +15,6 @@ from ..core.extras import optional
 from .pixels import AT_ONCE, PixelPoints, camera_rays
 
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
-LEAST_FINE = 8  # samples per pixel, from which on that gains something
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
 APART = 1 << 20  # samples without them that are worth a launch of their own
 LEAST_ERROR = 0.1  # of the mean, that every pixel is taken to have
@@ -28,21 +27,25 @@ LATE = 1.3  # times what is left of the time, which the last image may take
 
 
 class Way(NamedTuple):
-    """A way to denoise: what, how well, how long it takes beside the cheapest, and the share of all time, where that is
-    limited, up to which it is planned."""
+    """A way to denoise: what, how well, how long it takes beside the cheapest, the share of all time, where that is
+    limited, up to which it is planned, and the samples per pixel from which on it gains something, or, of the way that
+    is there to save time, more than further samples do."""
 
     parts: int  # of a pixel along each side
     quality: str
     cost: float
     share: float
+    least: int
 
 
 WAYS = (  # better and better
-    Way(1, "Balanced", 1.0, 1.0),
-    Way(1, "High", 2.0, 0.3),
-    Way(FINE, "Balanced", 2.8, 0.6),
-    Way(FINE, "High", 6.0, 0.3),
+    Way(1, "Balanced", 1.0, 1.0, 1),
+    Way(1, "High", 2.4, 0.25, 1),
+    Way(FINE, "Fast", 2.0, 0.6, 12),
+    Way(FINE, "Balanced", 4.0, 0.25, 8),
+    Way(FINE, "High", 9.6, 0.2, 8),
 )
+GLANCE = WAYS[0]._replace(quality="Fast")  # to tell two pictures apart, both at half the resolution
 
 
 def require_denoiser() -> Any:
@@ -75,16 +78,16 @@ class CleanPicture:
             raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
         self._draw, self._seed, self._rfilter = draw, seed, film.rfilter()
         width, height = (FINE * int(size) for size in film.crop_size())
-        # Of every part sums over samples of radiance, albedo and normals; how many have the first, and the others; and
-        # radiance of one half of the samples less the other.
-        self._sums, self._counts = np.zeros((3, height, width, 3), np.float32), np.zeros((2, height, width), np.int64)
-        self._apart = np.zeros((height, width, 3), np.float32)
+        # Of every part sums over samples of radiance, of that of one half of them less the other, of albedo and of normals;
+        # and how many have the first two, and the others.
+        self._sums = [dr.zeros(mi.Color3f, height * width) for _ in range(4)]
+        self._counts = np.zeros((2, height, width), np.int64)
         self._spp, self._spent, self._needed = 0, 0.0, None  # samples per pixel in the mean, and seconds they took
 
     def add(self, spp: int) -> int:
         """Take ``spp`` more samples per pixel, everywhere; or as many in the mean where they are needed, once it takes
         little of the time to tell. The first time fewer, as they take longer there. Returns how many."""
-        each, telling = self._spent / max(self._spp, 1), self._takes(WAYS[0])
+        each, telling = self._spent / max(self._spp, 1), self._takes(GLANCE)
         if self._spp and telling <= TELLING * spp * each:
             if self._needed is None:
                 spp = max(1, int((spp - telling / each) / DEARER))
@@ -146,12 +149,11 @@ class CleanPicture:
             planes = self._planes(points, *camera_rays(self._sensor, width, height, part, points), look)
             # Halves take turns in every part, and begin with neighbouring parts: in a pixel they are as many.
             wide = opaque_index(width)
-            planes.append(planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
-            *sums, apart = _sums_of_runs(planes, count)
+            planes.insert(1, planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
+            _add_runs(self._sums, planes, *(owned(mi.UInt32, x) for x in (parts, end - count, end)))
+            dr.sync_thread()  # lest launches wait side by side, with all their samples
             if len(parts) == parts[-1] + 1 - parts[0]:
                 parts = slice(parts[0], parts[-1] + 1)  # which is faster
-            self._apart.reshape(-1, 3)[parts] += apart
-            self._sums.reshape(3, -1, 3)[: len(sums), parts] += sums
             self._counts.reshape(2, -1)[: 1 + look, parts] += count
 
     def _planes(self, points, ray, weight, look):
@@ -164,16 +166,15 @@ class CleanPicture:
             valid, normal = si.is_valid(), mi.Vector3f(si.sh_frame.n)
             albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
             albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
-            planes += [mi.Color3f(albedo), dr.select(valid, normal, 0)]
+            planes += [mi.Color3f(albedo), mi.Color3f(dr.select(valid, normal, 0))]
         return planes
 
     def _where_needed(self):
         """What samples of pixels (float32 [height, width]) go with, for the sum of errors to be least;
         judged by how far two denoised halves are apart in 8-bit sRGB."""
         ndimage: Any = optional("scipy.ndimage", "denoising", "denoise")
-        (color, *features), apart = self._means(), self._apart / self._counts[0, ..., None].astype(np.float32)
-        color, apart, *features = (_blocks(x, COARSE * FINE) for x in (color, apart, *features))
-        one, other = (srgb(self._denoised([half, *features], WAYS[0])) for half in (color + apart, color - apart))
+        color, apart, *features = (_blocks(mean, COARSE * FINE) for mean in self._means())
+        one, other = (srgb(self._denoised([half, *features], GLANCE)) for half in (color + apart, color - apart))
         error = np.nan_to_num(np.mean((one - other) ** 2, axis=2)).repeat(COARSE, axis=0).repeat(COARSE, axis=1)
         taken = self._taken()
         error = ndimage.gaussian_filter(error[: taken.shape[0], : taken.shape[1]], SMOOTH)
@@ -197,8 +198,12 @@ class CleanPicture:
         return FINE**2 * _blocks(np.float32(self._counts[0, ..., None]), FINE)[..., 0]
 
     def _means(self):
-        """Means of radiance, albedo and normals (three [height, width, 3])."""
-        return [sums / self._counts[min(k, 1), ..., None].astype(np.float32) for k, sums in enumerate(self._sums)]
+        """Means of radiance, of one half of it less the other, of albedo and of normals (four [height, width, 3])."""
+        shape = *self._counts.shape[1:], 3
+        return [
+            np.array(plane).T.reshape(shape) / count[..., None].astype(np.float32)
+            for plane, count in zip(self._sums, np.repeat(self._counts, 2, axis=0))
+        ]
 
     def _denoised(self, planes, way):
         """Radiance without its noise, of it with albedo and normals, at the quality of a way."""
@@ -210,7 +215,8 @@ class CleanPicture:
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
         most = np.inf if seconds is None else LATE * seconds
         way = self._way(self._spp, lambda way: self._takes(way) <= most)
-        start, planes = time.perf_counter(), self._means()
+        start, (color, _, *features) = time.perf_counter(), self._means()
+        planes = color, *features
         clean = self._denoised(planes if way.parts > 1 else [_blocks(plane, FINE) for plane in planes], way)
         image = mi.TensorXf(_filtered(clean, self._rfilter, way.parts))
         CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
@@ -230,18 +236,22 @@ class CleanPicture:
 
     def _way(self, spp, allowed):
         """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
-        ways = [way for way in WAYS if allowed(way) and (way.parts == 1 or spp >= LEAST_FINE)]
+        ways = [way for way in WAYS if allowed(way) and spp >= way.least]
         return (ways or WAYS[:1])[-1]
 
 
-def _sums_of_runs(planes, count):
-    """Sums over runs of so many samples of colours [planes, runs, 3]."""
+def _add_runs(sums, planes, row, start, end):
+    """Add colours from ``start`` to ``end`` to rows of sums, in this order (UInt32 [runs])."""
     dr.eval(planes)
-    if count.min() == count.max():
-        sums = [[dr.block_sum(channel, int(count[0])) for channel in plane] for plane in planes]
-        return np.array(sums, dtype=np.float32).swapaxes(1, 2)
-    start = np.cumsum(count) - count
-    return [np.add.reduceat(np.array(plane), start, axis=1).T for plane in planes]
+    state = start, *(dr.gather(mi.Color3f, total, row) for total in sums[: len(planes)])
+
+    def add(k, *totals):
+        return k + 1, *(total + dr.gather(mi.Color3f, plane, k) for total, plane in zip(totals, planes))
+
+    _, *totals = dr.while_loop(state, lambda k, *_: k < end, add)
+    for total, more in zip(sums, totals):
+        dr.scatter(total, more, row)
+    dr.eval(sums)
 
 
 def _blocks(image, side):

@@ -78,7 +78,7 @@ class Gatherer:
             self._reach = _reach(elements)
             dr.eval(self._sharp, self._reach)
         self._place(landings)
-        self._lamps = LampChoice(model, elements)
+        self._lamps = LampChoice.of(elements)
         self._free = model.lights.free
         self.highlights = Highlights(model, self._lamps) if model.rays.glossy else None
 

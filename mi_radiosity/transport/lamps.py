@@ -6,7 +6,6 @@ import numpy as np
 
 from ..core.arrays import NONE, Distribution, lower_bound_within, opaque_index, totals
 from ..mesh import MAX_LEVEL, Elements
-from ..scene import Model
 
 MOST = 1 << 24  # entries of the table of elements and lamps; with more lamps than that, they are chosen by power
 BY_POWER = 0.1  # share of lines that are drawn by power whatever the place
@@ -20,8 +19,16 @@ class LampChoice:
     patches there are.
     """
 
-    def __init__(self, model: Model, elements: Elements) -> None:
-        self._patches, self._elements = model.patches, elements
+    @staticmethod
+    def of(elements: Elements) -> "LampChoice":
+        """That of a mesh, made once for all who gather on it."""
+        kept = vars(elements)
+        if "lamp_choice" not in kept:
+            kept["lamp_choice"] = LampChoice(elements)
+        return kept["lamp_choice"]
+
+    def __init__(self, elements: Elements) -> None:
+        self._patches = elements.patches
         self.lamps = dr.compress(dr.max(self._patches.emission) > 0)
         self.count = dr.width(self.lamps)
         self._rows = None
@@ -33,22 +40,20 @@ class LampChoice:
         self._by_power = Distribution(power, whole)
         self._number = dr.full(mi.UInt32, NONE, self._patches.count)
         dr.scatter(self._number, dr.arange(mi.UInt32, self.count), self.lamps)
-        level = self._finest_level()
+        level = self._finest_level(elements)
         if 1 < self.count and level is not None:
-            self._build_rows(mi.Float(power / dr.opaque(mi.Float64, whole)), opaque_index(level))
+            self._build_rows(elements, mi.Float(power / dr.opaque(mi.Float64, whole)), opaque_index(level))
 
-    def _finest_level(self):
+    def _finest_level(self, e):
         """The finest level that the table may have rows for, or for leaves above it; None if it may for none."""
-        e = self._elements
         every, leaf = (np.bincount(np.array(e.level(x)), minlength=MAX_LEVEL + 1) for x in (_all(e), e.leaves))
         rows = every + np.cumsum(leaf) - leaf  # elements of each level, and leaves above
         fits = np.flatnonzero(self.count * rows <= MOST)
         return int(fits[-1]) if len(fits) else None
 
-    def _build_rows(self, share, level):
+    def _build_rows(self, e, share, level):
         """Cumulative shares of all lamps, element by element (Float [elements · lamps])."""
-        p, e = self._patches, self._elements
-        at = _all(e)
+        p, at = self._patches, _all(e)
         on_level, is_leaf = e.level(at) == level, dr.gather(mi.UInt32, e.child, at) == 0
         places = dr.gather(mi.UInt32, at, dr.compress(on_level | (is_leaf & (e.level(at) < level))))
         k = dr.arange(mi.UInt32, self.count * dr.width(places))
