@@ -23,7 +23,6 @@ TELLING = 0.3  # of the time of samples, that may be spent on where they are nee
 DEARER = 1.2  # times what others take: samples there, as much of it is gloss and glass
 COARSE = 2  # pixels along each side, that are denoised as one to tell where samples are needed
 SMOOTH = 1.5  # pixels that the error of one is judged by
-LATE = 1.3  # times what is left of the time, which the last image may take
 
 
 class Way(NamedTuple):
@@ -78,8 +77,8 @@ class CleanPicture:
             raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
         self._draw, self._seed, self._rfilter = draw, seed, film.rfilter()
         width, height = (FINE * int(size) for size in film.crop_size())
-        # Of every part sums over samples of radiance, of that of one half of them less the other, of albedo and of normals;
-        # and how many have the first two, and the others.
+        # Of every part sums over samples of radiance, of that of one half of them less the other, of albedo and of
+        # normals; and how many have the first two, and the others.
         self._sums = [dr.zeros(mi.Color3f, height * width) for _ in range(4)]
         self._counts = np.zeros((2, height, width), np.int64)
         self._spp, self._spent, self._needed = 0, 0.0, None  # samples per pixel in the mean, and seconds they took
@@ -213,7 +212,7 @@ class CleanPicture:
 
     def image(self, seconds: float | None = None) -> "mi.TensorXf":
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
-        most = np.inf if seconds is None else LATE * seconds
+        most = np.inf if seconds is None else seconds
         way = self._way(self._spp, lambda way: self._takes(way) <= most)
         start, (color, _, *features) = time.perf_counter(), self._means()
         planes = color, *features

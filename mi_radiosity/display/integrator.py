@@ -16,6 +16,7 @@ from .denoise import CleanPicture
 from .pixels import FilmPicture, grow
 from .shaders import SHADERS, Look
 
+LATE = 0.05  # of the time, that may pass beyond it until the last image is as good as planned
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
 
 
@@ -87,8 +88,10 @@ def _integrator_class():
             if seconds is None:
                 picture.take(spp)
             else:
-                grow(picture, seconds - (time.perf_counter() - start), show or (lambda image, samples: None))
-                seconds -= time.perf_counter() - start
+                whole = seconds - (time.perf_counter() - start)
+                done = grow(picture, whole, show or (lambda image, samples: None))
+                left = seconds - (time.perf_counter() - start)
+                seconds = min(max(left, picture.finishing(whole, done)), left + LATE * seconds)
             return picture.image(seconds)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
