@@ -113,9 +113,10 @@ def test_solves_get_what_the_time_allows(box, monkeypatch):
     assert budgets[3][:2] == (None, usual.rays) and elements[4:] == (None, None)  # as by default
     assert set(paces) == {pace} and 0 < pace.ray * usual.rays < usual.seconds
     assert rays[-1] == cost.MOST * usual.rays and model.patches.count < elements[0] < usual.elements
-    assert cost.affordable(10**6, 1000, 2.0, 2.0**-18) == 2**19  # what is left decides, unless it would be noisy
-    assert cost.affordable(10**6, 1000, -1.0, 1e-5) == 1000 * cost.FEW_RAYS
-    assert cost.affordable(10**4, 1000, 2.0, 2.0**-18) == 10**4
+    assert cost.affordable(10**6, 1000, 3.0, 1.0, 2.0**-18) == 2**19  # what is left decides, unless it would be noisy
+    assert cost.affordable(10**6, 1000, 1.0, 2.0, 2.0**-18) == int(cost.RAYS_SHARE * 2**18)  # rays have a share
+    assert cost.affordable(10**6, 1000, 1.0, 2.0, 1e-4) == 1000 * cost.FEW_RAYS
+    assert cost.affordable(10**4, 1000, 3.0, 1.0, 2.0**-18) == 10**4
     monkeypatch.undo()
     solution = mr.solve(box, seconds=0.05, rays=10_000)
     assert solution.stats["rays"] == 10_000 and solution.stats["elements"] < usual.elements

@@ -16,6 +16,7 @@ RAYS_PER_ELEMENT, LEAST_RAYS = 300, 20  # default ray budget: for the first ELEM
 SOLVING_SHARE = 0.25  # of the time for solve and pictures: 15 % and 50 % were worse
 TOP = 1 / 4  # of the elements, at least, are there before the oracle is asked, where patches share them
 FEW_RAYS = 30  # per element, below which it is noisy, and shares with others if the time is short
+RAYS_SHARE = 0.4  # of the time of a solve, that rays have at least: classroom, 20 s in all: 5.8 → 5.0
 FEW_SHARED = 32_000  # elements that many patches share where time is short: with 19,000 pictures are up to 12 % worse
 ENOUGH_RAYS = 60  # per element: as long as there are fewer, rays add more to a picture than elements
 MOST = 4  # times the default rays: more add less to a picture than camera samples do
@@ -137,13 +138,16 @@ def afford(
         fewer, cast = budget(share)
         return pace.ray * cast + pace.element * _sizes(model, fewer)[1] <= work * (1 + 1e-9)
 
-    return *budget(max(filter(fits, SHARES), default=SHARES[0])), pace
+    fewer, cast = budget(max(filter(fits, SHARES), default=SHARES[0]))
+    least = min(usual, round(RAYS_SHARE * seconds / max(pace.ray, 1e-12)))
+    return fewer, rays or max(cast, least), pace
 
 
-def affordable(rays: int, elements: int, seconds: float, each: float) -> int:
-    """How many of the planned rays fit into the seconds that are left at so many for each; not so few that elements are
-    noisy."""
-    return min(rays, max(FEW_RAYS * elements, int(seconds / max(each, 1e-12))))
+def affordable(rays: int, elements: int, seconds: float, spent: float, each: float) -> int:
+    """How many of the planned rays fit into what is left of a solve's seconds, at so many for each; not so few that
+    elements are noisy."""
+    left = max(seconds - spent, RAYS_SHARE * seconds)
+    return min(rays, max(FEW_RAYS * elements, int(left / max(each, 1e-12))))
 
 
 def _seconds(model, follow):

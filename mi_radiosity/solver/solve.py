@@ -91,7 +91,7 @@ def solve(
 
     rays = int(rays or default_rays(model, count))
     if seconds is not None and not fixed:  # now that it is known what refinement took
-        rays = affordable(rays, count, seconds - clock.total(), pace.ray)
+        rays = affordable(rays, count, seconds, clock.total(), pace.ray)
 
     def carry(problem, rays_here, number=0, before=0):
         """Transport with a part of the rays: a Flow."""
