@@ -16,7 +16,7 @@ from .denoise import CleanPicture
 from .pixels import FilmPicture, grow
 from .shaders import SHADERS, Look
 
-LATE = 0.05  # of the time, that may pass beyond it until the last image is as good as planned
+LATE = 0.1  # of the time, that may pass beyond it until the last image is as good as planned
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
 
 
