@@ -235,7 +235,7 @@ def test_more_samples_are_taken_where_denoised_halves_differ(box):
     np.testing.assert_array_equal(pictures[0]._counts, pictures[1]._counts)
     np.testing.assert_array_equal(*(np.array(picture.image()) for picture in pictures))
     assert counts.mean() == pytest.approx(64, rel=0.02) and counts.min() >= 16
-    parts, means = pictures[0]._counts[0], pictures[0]._means()[0][..., 0]
+    parts, means = pictures[0]._counts[0], pictures[0]._mean(0)[..., 0]
     noisy = denoise._blocks(np.float32((means != 0.5)[..., None]), denoise.FINE)[..., 0] > 0
     assert 0.02 < noisy.mean() < 0.3 and counts[noisy].mean() > 3 * counts[~noisy].mean()
     n = parts[means != 0.5].sum()

@@ -139,9 +139,10 @@ class CleanPicture:
             end = np.cumsum(count)
             k = dr.arange(mi.UInt32, int(end[-1]))
             alike = count.min() == count.max()
-            row = k // opaque_index(int(count[0])) if alike else lower_bound(owned(mi.UInt32, end), k + 1)
-            tables = parts, end - count, first[parts], total[parts], before[parts]
-            part, start, index, of, done = (dr.gather(mi.UInt32, owned(mi.UInt32, table), row) for table in tables)
+            tables = parts, end - count, end, first[parts], total[parts], before[parts]
+            rows, starts, ends, *tables = (owned(mi.UInt32, table) for table in tables)
+            row = k // opaque_index(int(count[0])) if alike else lower_bound(ends, k + 1)
+            part, start, index, of, done = (dr.gather(mi.UInt32, table, row) for table in (rows, starts, *tables))
             index += k - start
             dr.eval(part, index, of, done)
             points = self._draw(part, index, of, done, self._seed)
@@ -149,7 +150,7 @@ class CleanPicture:
             # Halves take turns in every part, and begin with neighbouring parts: in a pixel they are as many.
             wide = opaque_index(width)
             planes.insert(1, planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
-            _add_runs(self._sums, planes, *(owned(mi.UInt32, x) for x in (parts, end - count, end)))
+            _add_runs(self._sums, planes, rows, starts, ends)
             dr.sync_thread()  # lest launches wait side by side, with all their samples
             if len(parts) == parts[-1] + 1 - parts[0]:
                 parts = slice(parts[0], parts[-1] + 1)  # which is faster
@@ -172,7 +173,7 @@ class CleanPicture:
         """What samples of pixels (float32 [height, width]) go with, for the sum of errors to be least;
         judged by how far two denoised halves are apart in 8-bit sRGB."""
         ndimage: Any = optional("scipy.ndimage", "denoising", "denoise")
-        color, apart, *features = (_blocks(mean, COARSE * FINE) for mean in self._means())
+        color, apart, *features = (_blocks(self._mean(k), COARSE * FINE) for k in range(4))
         one, other = (srgb(self._denoised([half, *features], GLANCE)) for half in (color + apart, color - apart))
         error = np.nan_to_num(np.mean((one - other) ** 2, axis=2)).repeat(COARSE, axis=0).repeat(COARSE, axis=1)
         taken = self._taken()
@@ -196,13 +197,10 @@ class CleanPicture:
         """Samples of pixels (float32 [height, width])."""
         return FINE**2 * _blocks(np.float32(self._counts[0, ..., None]), FINE)[..., 0]
 
-    def _means(self):
-        """Means of radiance, of one half of it less the other, of albedo and of normals (four [height, width, 3])."""
-        shape = *self._counts.shape[1:], 3
-        return [
-            np.array(plane).T.reshape(shape) / count[..., None].astype(np.float32)
-            for plane, count in zip(self._sums, np.repeat(self._counts, 2, axis=0))
-        ]
+    def _mean(self, k):
+        """Mean of what the sums number k are of [height, width, 3]."""
+        count = self._counts[k // 2, ..., None]
+        return np.array(self._sums[k]).T.reshape(*count.shape[:2], 3) / count.astype(np.float32)
 
     def _denoised(self, planes, way):
         """Radiance without its noise, of it with albedo and normals, at the quality of a way."""
@@ -214,8 +212,7 @@ class CleanPicture:
         """What has been sampled, without its noise; as well as ``seconds`` allow, if given."""
         most = np.inf if seconds is None else seconds
         way = self._way(self._spp, lambda way: self._takes(way) <= most)
-        start, (color, _, *features) = time.perf_counter(), self._means()
-        planes = color, *features
+        start, planes = time.perf_counter(), [self._mean(k) for k in (0, 2, 3)]
         clean = self._denoised(planes if way.parts > 1 else [_blocks(plane, FINE) for plane in planes], way)
         image = mi.TensorXf(_filtered(clean, self._rfilter, way.parts))
         CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
