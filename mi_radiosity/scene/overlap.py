@@ -11,9 +11,9 @@ from .faces import Faces
 from .lookup import EDGE, Lookup, barycentric
 
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
-CORNERS = 8  # of a box
 GUESS = 12  # pairs of faces that are near each other, per face
 FINEST = 30  # a grid has up to 2^30 cells along an axis
+LOOKERS, FINER = 2, 4  # a cell is halved up to 4 times, where 2, 8, 32 … faces look for one that is there
 ABOUT = 0.999  # of the area of another face: as large, to float32
 LATTICE = 8  # points along a side that show whether a face is covered
 
@@ -106,8 +106,7 @@ def coplanar_pairs(
         meet = dr.compress(faces.meet(*ends))
         found.append(np.column_stack([chosen[np.array(dr.gather(mi.UInt32, x, meet))] for x in ends]))
     pairs = np.concatenate(found)
-    pairs = np.concatenate([pairs, pairs[:, ::-1]])
-    return pairs[np.lexsort(pairs.T[::-1])].T
+    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
 
 
 class _Triangles:
@@ -199,30 +198,33 @@ class _Triangles:
 
 
 class _Grid:
-    """Finds faces near each other. Each lies in those cells that its box meets, of a grid as fine as it is large, and
-    looks there, and in all coarser grids, for faces of their size. Cells of one key only cost time."""
+    """Finds faces near each other. Each lies in those cells that its box meets, of a grid for faces of its size, and
+    looks there, and in the grids of all larger ones. A grid is as fine as its faces are large, or finer if they are few
+    beside those that look for them. Cells of one key only cost time."""
 
     def __init__(self, triangles: _Triangles) -> None:
         self._triangles = triangles
-        levels, own = np.unique(triangles.level, return_inverse=True)
+        levels, own, there = np.unique(triangles.level, return_inverse=True, return_counts=True)
+        finer = np.clip(np.log2(np.cumsum(there) / (LOOKERS * there)) // 2, 0, FINER)
         self._first = owned(mi.UInt32, own)  # grid of a face
-        self._grids, self._scale = opaque_index(len(levels)), owned(mi.Float64, 2.0**-levels)
+        self._grids = opaque_index(len(levels))
+        self._scale = owned(mi.Float64, 2.0 ** -np.maximum(levels - finer, levels[0]))
         bits = len(own).bit_length() + 1
         self._shift = opaque_index(32 - bits)
-        found, faces = [], []
-        face = dr.arange(mi.UInt32, len(own))
-        for corner in range(CORNERS):
-            cell, corners = self._cell(face, self._first, mi.UInt32(corner))
-            rows = dr.compress((corner & ~corners) == 0)
-            found.append(np.array(dr.gather(mi.UInt32, self._key(cell, self._first), rows)))
-            faces.append(np.array(rows))
-        keys = np.concatenate(found)
-        order = np.argsort(keys, kind="stable")
-        self._there = owned(mi.UInt32, np.concatenate(faces)[order])
+        low, high = (np.array(x, dtype=np.int64) for x in self._cells(dr.arange(mi.UInt32, len(own)), self._first))
+        width = high - low + 1
+        count = width.prod(axis=0)
+        end = np.cumsum(count)
+        face = np.repeat(np.arange(len(own)), count)
+        part = np.arange(end[-1]) - np.repeat(end - count, count)
+        x, y = part % width[0, face], part // width[0, face]
+        cell = [owned(mi.UInt32, low[k, face] + c) for k, c in enumerate((x, y % width[1, face], y // width[1, face]))]
+        keys = np.array(self._key(cell, owned(mi.UInt32, own[face])))
+        self._there = owned(mi.UInt32, face[np.argsort(keys, kind="stable")])
         self._start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(np.bincount(keys, minlength=2**bits))]))
 
     def pairs(self) -> "tuple[mi.UInt32, mi.UInt32]":
-        """Pairs of faces that are near each other, each of them once, in any order (two UInt32 [pairs])."""
+        """Pairs of faces that are near each other, hardly one of them twice, in any order (two UInt32 [pairs])."""
         room = GUESS * dr.width(self._first)
         while True:
             f, g = (dr.zeros(mi.UInt32, room) for _ in range(2))
@@ -240,24 +242,30 @@ class _Grid:
             mi.UInt32(self._first),
             opaque_index(dr.width(f)),
         )
-        grid, corner, own = mi.UInt32(self._first), mi.UInt32(0), self._triangles.look(face)  # where to look next
-        here, x, y, z, place, end = (mi.UInt32(0) for _ in range(6))
+        grid, own = mi.UInt32(self._first), self._triangles.look(face)
+        x, y, z = self._cells(face, grid)[0]  # where to look next
+        here, i, j, k, place, end = (mi.UInt32(0) for _ in range(6))
         # No loop in the loop: faces with little in their cells would wait for those with much.
         while (place < end) | (grid < self._grids):
             if place >= end:
-                here = mi.UInt32(grid)
-                (x, y, z), corners = self._cell(face, here, corner)
-                key = self._key((x, y, z), here)
-                place, end = (dr.gather(mi.UInt32, self._start, k) for k in (key, key + 1))
-                corner = (corner - corners) & corners  # after the last one it is the first again
-                grid += dr.select(corner == 0, mi.UInt32(1), 0)
+                here, i, j, k = mi.UInt32(grid), mi.UInt32(x), mi.UInt32(y), mi.UInt32(z)
+                key = self._key((i, j, k), here)
+                place, end = (dr.gather(mi.UInt32, self._start, n) for n in (key, key + 1))
+                (x0, y0, _), (x1, y1, z1) = self._cells(face, here)
+                x += 1
+                y = dr.select(x > x1, y + 1, y)
+                z = dr.select(y > y1, z + 1, z)
+                x, y = dr.select(x > x1, x0, x), dr.select(y > y1, y0, y)
+                if z > z1:
+                    grid += 1
+                    x, y, z = self._cells(face, dr.minimum(grid, self._grids - 1))[0]
             if place < end:
                 other = dr.gather(mi.UInt32, self._there, place)
                 # Of two in one grid one looks at the other.
                 wanted = (dr.gather(mi.UInt32, self._first, other) == here) & ((here > first) | (other < face))
                 wanted &= self._triangles.near_plane(own, self._triangles.look(other, wanted))
                 if wanted:
-                    near = self._triangles.boxes_meet(face, other, self._counts_here(face, other, here, (x, y, z)))
+                    near = self._triangles.boxes_meet(face, other, self._counts_here(face, other, here, (i, j, k)))
                     at = dr.scatter_inc(count, mi.UInt32(0), near)
                     near &= at < room
                     dr.scatter(f, face, at, near)
@@ -269,18 +277,16 @@ class _Grid:
         """Does the box that two faces share begin in this cell of several that both are in (Bool [n])?"""
         scale, here = dr.gather(mi.Float64, self._scale, grid), mi.Bool(True)
         for low, c in zip(self._triangles.low, cell):
-            here &= mi.UInt32(dr.maximum(*(dr.gather(mi.Float64, low, x) for x in (face, other))) * scale) == c
+            here &= (
+                mi.UInt32(mi.Int32(dr.maximum(*(dr.gather(mi.Float64, low, x) for x in (face, other))) * scale)) == c
+            )
         return here
 
-    def _cell(self, face, grid, corner):
-        """The cell of a grid that a corner of the boxes of faces lies in (three UInt32 [n]); and which corners lie in
-        cells of their own (UInt32 [n]): those whose bits are among these."""
-        scale, cell, corners = dr.gather(mi.Float64, self._scale, grid), [], mi.UInt32(0)
-        for axis, (low, high) in enumerate(zip(self._triangles.low, self._triangles.high)):
-            a, b = (mi.UInt32(dr.gather(mi.Float64, x, face) * scale) for x in (low, high))
-            corners |= dr.select(a != b, mi.UInt32(1 << axis), 0)
-            cell.append(dr.select((corner & (1 << axis)) != 0, b, a))
-        return cell, corners
+    def _cells(self, face, grid):
+        """The first and the last of the cells of a grid that the boxes of faces meet (three UInt32 [n] each)."""
+        scale = dr.gather(mi.Float64, self._scale, grid)
+        ends = self._triangles.low, self._triangles.high
+        return [[mi.UInt32(mi.Int32(dr.gather(mi.Float64, x, face) * scale)) for x in end] for end in ends]
 
     def _key(self, cell, grid):
         """A number below that of keys, from the cell of a grid (UInt32 [n])."""
