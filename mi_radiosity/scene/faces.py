@@ -12,6 +12,13 @@ from ..core.errors import RadiosityError
 from .tessellate import tracing_scene
 
 RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
+SPREAD = (  # of bits to every third: shifts, and the bits that are right after them
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
 FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 
 
@@ -134,10 +141,9 @@ def _canonical_order(corners):
     # Off the borders of cells, where halves and thirds lie: rounding must not decide there.
     place = (centroid - low) / max((centroid - low).max(), np.finfo(float).tiny) * (3**0.5 - 1) + 1 - 3**0.5 / 2
     cell = (place * (2**20 - 1)).astype(np.uint64)
-    morton = np.zeros(len(corners), dtype=np.uint64)
-    for bit in range(20):
-        for axis in range(3):
-            morton |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    for shift, mask in SPREAD:
+        cell = (cell | cell << np.uint64(shift)) & np.uint64(mask)
+    morton = cell[:, 0] | cell[:, 1] << np.uint64(1) | cell[:, 2] << np.uint64(2)
     words = np.ascontiguousarray(corners, dtype=np.float32).reshape(len(corners), 9).view(np.uint32).astype(np.uint64)
     odd = np.uint64(0x9E3779B97F4A7C15) * (2 * np.arange(9, dtype=np.uint64) + np.uint64(1))
     return np.lexsort(((words * odd).sum(axis=1), morton))

@@ -42,6 +42,7 @@ class Materials:
         self.two_sided = two_sided[faces.shape]
         textured = np.array([is_textured(s.bsdf()) for s in shapes])
         self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
+        self._alike = np.array([has_like_sides(s.bsdf()) for s in shapes])
         self.bsdfs = mi.BSDFPtr([s.bsdf() for s in shapes])
         self.glossy = bool(dr.any(is_glossy(self.bsdfs))[0])
         self.traced_faces = owned(mi.UInt32, self.traced[faces.shape])
@@ -102,35 +103,42 @@ class Materials:
         each = max(LEAST, min(FACE_SAMPLES, MANY // max(len(various), 1)))
         for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, each, False)):
             for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
-                albedo = self._albedo(part, samples) if len(part) else np.zeros((2, 0, 3))
-                for rho, side in zip(albedo, self.rho):
+                for rho, side in zip(self._albedos(part, samples), self.rho):
                     if spread:
                         for face, value in zip(part, rho):
                             side[shape == shape[face]] = value
                     else:
                         side[part] = rho
 
-    def _albedo(self, faces, samples):
-        """E[w; diffuse] of BSDFs at random points of faces, for cosine-distributed directions [2 sides, faces, 3]."""
+    def _albedos(self, faces, samples):
+        """E[w; diffuse] of BSDFs on both sides of faces (two [faces, 3])."""
+        front = self._albedo(faces, samples, 1)
+        alike = self._alike[self._faces.shape[faces]]
+        back, other = np.where(alike[:, None], front, 0), self.two_sided[faces] & ~alike
+        back[other] = self._albedo(faces[other], samples, -1)
+        return front, back
+
+    def _albedo(self, faces, samples, side):
+        """The same on the front, or the back if ``side`` is −1: at random points, for cosine-distributed directions."""
+        if not len(faces):
+            return np.zeros((0, 3))
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
         key = owned(mi.UInt32, self._faces.rank[faces])  # not Mitsuba's number of the face, which varies
         x, y, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
         a, b, c, _ = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO, 1)), k // each)
-        si, rho = self._faces.surface(face, *triangle(x, y)), []
+        si = self._faces.surface(face, *triangle(x, y))
         wi, gloss = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t)), Gloss(mi.TransportMode.Radiance)
-        for side in (1, -1):
-            si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
-            bsdf = si.bsdf()
-            sample, value = bsdf.sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
-            if self.glossy:
-                value = gloss.weigh(bsdf, si, sample, value, gloss.shares(bsdf, si, dr.full(mi.Bool, True, len(k))))
-            drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-            value = dr.select(drawn & dr.isfinite(value), value, 0)
-            dr.eval(value)  # in one go: sums one by one would draw all again
-            rho.append(np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples)
-        return np.array(rho)
+        si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
+        bsdf = si.bsdf()
+        sample, value = bsdf.sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
+        if self.glossy:
+            value = gloss.weigh(bsdf, si, sample, value, gloss.shares(bsdf, si, dr.full(mi.Bool, True, len(k))))
+        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        value = dr.select(drawn & dr.isfinite(value), value, 0)
+        dr.eval(value)  # in one go: sums one by one would draw all again
+        return np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples
 
     def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""
@@ -156,6 +164,11 @@ def is_diffuse(bsdf: "mi.BSDF") -> bool:
     if kind in NESTING:
         return all(is_diffuse(part) for part in children(bsdf) if isinstance(part, mi.BSDF))
     return kind in DIFFUSE
+
+
+def has_like_sides(bsdf: "mi.BSDF") -> bool:
+    """Is ``bsdf`` one that is wrapped, to be the same on both sides of a surface?"""
+    return bsdf.class_name() == "TwoSidedBRDF" and len({part.ptr for part in children(bsdf)}) == 1
 
 
 def is_textured(bsdf: "mi.BSDF") -> bool:

@@ -219,8 +219,8 @@ class _Grid:
         part = np.arange(end[-1]) - np.repeat(end - count, count)
         x, y = part % width[0, face], part // width[0, face]
         cell = [owned(mi.UInt32, low[k, face] + c) for k, c in enumerate((x, y % width[1, face], y // width[1, face]))]
-        keys = np.array(self._key(cell, owned(mi.UInt32, own[face])))
-        self._there = owned(mi.UInt32, face[np.argsort(keys, kind="stable")])
+        keys = np.array(self._key(cell, owned(mi.UInt32, own[face])), dtype=np.int64)
+        self._there = owned(mi.UInt32, np.sort(keys << 32 | face) & 0xFFFFFFFF)
         self._start = owned(mi.UInt32, np.concatenate([[0], np.cumsum(np.bincount(keys, minlength=2**bits))]))
 
     def pairs(self) -> "tuple[mi.UInt32, mi.UInt32]":
