@@ -166,14 +166,21 @@ class Elements:
             above = crown.holds(element) & (dr.gather(mi.UInt32, self.child, element) != 0)
         return element
 
-    @dr.syntax
-    def leaf_at(
+    def leaf_at(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True) -> "mi.UInt32":
+        """The leaf that holds the point (u, v) of patches (UInt32 [n])."""
+        return self._descend(patch, u, v, active)
+
+    def leaf_below(
         self, element: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
     ) -> "mi.UInt32":
         """The leaf below ``element`` that holds the patch point (u, v) (UInt32 [n])."""
-        element = mi.UInt32(element)
+        return self._descend(element, *self.own_point(element, u, v, active), active)
+
+    @dr.syntax
+    def _descend(self, element: "mi.UInt32", a: "mi.Float", b: "mi.Float", active: "mi.Bool | bool") -> "mi.UInt32":
+        """The leaf below ``element`` that holds its own point (a, b)."""
+        element, a, b = mi.UInt32(element), mi.Float(a), mi.Float(b)
         child = dr.gather(mi.UInt32, self.child, element, active)
-        a, b = self.own_point(element, u, v, active)
         while child != 0:
             which = child_at(a, b)
             a, b = child_point(which, a, b)

@@ -45,4 +45,4 @@ def trusted(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32
     receiver = spread(problem, hit, pair)
     in_view = dr.gather(mi.Bool, pairs.asked, pair, known) & ~dr.gather(mi.Bool, pairs.occluded, pair, known)
     spreads = known & in_view & ~dr.gather(mi.Bool, problem.exposure.crossed, receiver, known)
-    return problem.elements.leaf_at(receiver, hit.u, hit.v, (hit.patch != NONE) & ~spreads)
+    return problem.elements.leaf_below(receiver, hit.u, hit.v, (hit.patch != NONE) & ~spreads)
