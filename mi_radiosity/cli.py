@@ -122,7 +122,8 @@ def _solve_arguments(group):
     wanted = "elements wanted, fewer than faces too (default: 19,000 more than the patches, 114,000 at most)"
     add("--elements", type=positive, metavar="N", help=wanted)
     add("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
-    rays = "rays in all that carry power and gather it (default: 300 for each of 19,000 elements, 20 for each of all)"
+    rays = "rays in all that carry power and gather it (default: 300 for each of 19,000 elements, 20 for each of all, "
+    rays += "twice as many with lamps like the sun)"
     add("--rays", type=positive, metavar="N", help=rays)
     add("--lines", type=positive, metavar="S", help="random lines per pair (default 10)")
     add("--seed", type=int, metavar="K", help="random seed (default 0)")

@@ -168,7 +168,7 @@ def border_values(solution):
     patch = dr.gather(mi.UInt32, e.patch, index)
     shown = ~np.array(is_covered(e, model.rays, index, u, v)).astype(bool)
     found = (
-        mi_radiosity.display.Field(solution).at(index, u, v),
+        mi_radiosity.solver.Field(solution).at(index, u, v),
         model.patches.point(patch, u, v),
         dr.gather(mi.Vector3f, model.patches.normal, patch),
     )

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import mi_radiosity as mr
-from mi_radiosity.display import Field
+from mi_radiosity.solver import Field
 
 import drjit as dr
 import mitsuba as mi
@@ -130,6 +130,8 @@ def test_unknown_shading_and_sensor(solution):
         solution.render(shading="toon")
     with pytest.raises(mr.RadiosityError, match="sensor 3"):
         solution.render(3)
+    with pytest.raises(mr.RadiosityError, match="spp"):
+        solution.render(spp=0)
 
 
 def box(low, high, rho, **parts):

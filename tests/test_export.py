@@ -317,6 +317,8 @@ def test_export_knows_the_scene(kept, tmp_path, capsys):
         (["-o", "nowhere/x.ply"], "does not exist"),
         (["-o", "x.ply", "--exposure", "0"], "greater than 0"),
         (["-o", "x.ply", "--exposure", "bright"], "'auto' or a number"),
+        (["-o", "x.xml", "--exposure", "auto"], "holds light"),
+        (["-o", "x.ply", "--seed", "0"], "--lightmap"),
         (["-o", "x.ply", "--scene", "none.xml"], "none.xml does not exist"),
         ([], "-o"),
     ],

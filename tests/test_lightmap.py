@@ -279,6 +279,7 @@ def test_textures_are_in_the_base_colour(tmp_path):
         (["-o", "x.exr", "--lightmap", "big"], "invalid int"),
         (["-o", "nowhere/x.exr", "--lightmap", "64"], "nowhere does not exist"),
         (["-o", "x.glb", "--lightmap", "64", "--exposure", "-1"], "exposure"),
+        (["-o", "x.exr", "--lightmap", "64", "--exposure", "2"], "holds light"),
         (["-o", "x.glb", "--denoise"], "add --lightmap SIZE"),
     ],
 )

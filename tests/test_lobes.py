@@ -1,9 +1,12 @@
 """Lobes that are not diffuse: every material of Mitsuba against `path`, energy, and what stays as it was."""
 
 import gc
+from importlib.util import find_spec
 from weakref import ref
 
 import mi_radiosity as mr
+from mi_radiosity.core.color import srgb
+from mi_radiosity.display.lux import VIRIDIS
 from mi_radiosity.scene import Model
 from mi_radiosity.scene.lobes import Lobes
 
@@ -42,7 +45,7 @@ def box(material):
     parts = mi.cornell_box()
     del parts["integrator"]
     parts["sensor"]["film"] |= {"width": 48, "height": 48, "rfilter": {"type": "box"}}
-    bsdf = MATERIALS[material]
+    bsdf = MATERIALS.get(material, DIFFUSE)
     parts["large-box"]["bsdf"] = bsdf if material in TRANSPARENT else {"type": "twosided", "bsdf": bsdf}
     return mi.load_dict(parts)
 
@@ -54,6 +57,52 @@ def test_pictures_agree_with_path(material):
         box(material), aside={"large-box": ASIDE.get(material, 0.01)}, elements=2000, rays=300_000
     )
     assert np.mean([balance(solution) for solution in solutions]) == pytest.approx(1, abs=0.01)
+
+
+def seen(scene, name):
+    """Pixels whose middle is on a shape (bool [height, width])."""
+    sensor, (shape,) = scene.sensors()[0], (shape for shape in scene.shapes() if shape.id() == name)
+    width, height = sensor.film().crop_size()
+    k = dr.arange(mi.UInt32, width * height)
+    place = mi.Point2f((k % width + 0.5) / width, (k // width + 0.5) / height)
+    ray, _ = sensor.sample_ray(0, 0, place, 0)
+    return np.array(scene.ray_intersect_preliminary(ray).shape == mi.ShapePtr(shape)).reshape(height, width)
+
+
+@pytest.mark.parametrize("material", ["diffuse", "plastic"])
+def test_hidden_lamps(material):
+    """What is behind a lamp is seen, as `path` sees it; denoised, too."""
+    room = box(material)
+    where = seen(room, "light")
+    hides = {"hide_emitters": True}
+    path = np.array(mi.render(room, integrator=mi.load_dict({"type": "path", "max_depth": -1} | hides), spp=4096))
+    radiosity = mi.load_dict({"type": "radiosity", "shading": "gather", "elements": 3000, "rays": 300_000} | hides)
+    for denoise in (False, True) if find_spec("mitsuba_oidn") else (False,):
+        ours = np.array(radiosity.picture(room, 0, 0, 64, denoise))[..., :3]
+        assert where.sum() > 12 and path[where].max() < 3  # the lamp shines with 18
+        assert ours[where].mean() == pytest.approx(path[where].mean(), abs=0.02 * float(path.mean()))
+        assert ours[~where].mean() == pytest.approx(path[~where].mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("material", ["plastic", "rough conductor"])
+def test_colors_have_no_coats(material):
+    """Every pixel of `lux` shading is one of its colours, also on coats and in mirrors."""
+    solution = mr.solve(box(material), elements=2000, rays=100_000)
+    colors = srgb(np.array(solution.render(spp=1, shading="lux"))[..., :3].reshape(-1, 3))
+    table = 255 * np.array(VIRIDIS) / 1000
+    place = np.linspace(0, len(table) - 1, 3000)
+    curve = np.column_stack([np.interp(place, np.arange(len(table)), column) for column in table.T])
+    apart = np.abs(colors[:, None] - curve).max(axis=2).min(axis=1)[colors.any(axis=1)]  # beside the box it is black
+    assert len(apart) > 1500 and (apart < 1).all() and len(np.unique(np.round(colors[:, 1]))) > 20
+
+
+def test_outlines_are_not_looked_for_in_mirrors():
+    room = box("conductor")
+    mirror = seen(room, "large-box")
+    solution = mr.solve(room, elements=2000, rays=100_000)
+    plain, mesh = (np.array(solution.render(spp=16, shading=s))[..., :3] for s in ("gouraud", "mesh"))
+    outlined = (mesh < 0.98 * plain).any(axis=2)
+    assert mirror.sum() > 100 and outlined[mirror].mean() < 0.2 < outlined[~mirror].mean()  # those at its edges
 
 
 @pytest.mark.parametrize(

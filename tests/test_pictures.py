@@ -1,11 +1,13 @@
 """Pictures that grow: within a time, denoised, of rough metal; and a gallery of them."""
 
 import re
+from types import SimpleNamespace
 
 import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.display import denoise, pixels
 from mi_radiosity.display.image import write_image
+from mi_radiosity.evaluation import gallery
 from mi_radiosity.scene import Model
 from mi_radiosity.scene.lobes import Lobes
 from mi_radiosity.solver import cost
@@ -192,7 +194,7 @@ def test_denoising_parts_of_pixels_keeps_edges(box, solution, monkeypatch):
     true = np.mean([mi.render(box, integrator=mi.load_dict(PATH), spp=256, seed=k) for k in range(8)], axis=0)[..., :3]
     integrator = mi.load_dict({"type": "radiosity"})
     integrator.show(solution, "gather")
-    picture = denoise.CleanPicture(box, box.sensors()[0], integrator._sample, seed=1)
+    picture = denoise.CleanPicture(integrator._see, box.sensors()[0], integrator._sample, seed=1)
     picture.add(62)
     colors, features = picture._counts
     assert (picture._taken() == 62).all() and colors.min() == 15 and colors.max() == 16
@@ -219,7 +221,7 @@ def test_camera_rays_are_mitsubas():
         np.testing.assert_allclose(np.array(a), np.array(b), atol=2e-6)
 
 
-def noise_in_a_corner(scene, points, ray, met):
+def noise_in_a_corner(points, ray, met):
     """Black or white, by chance, in the lower left of the picture; grey elsewhere."""
     corner = (ray.d.x > 0.15) & (ray.d.y < -0.15)
     return mi.Color3f(dr.select(corner, dr.select(points.next_1d() < 0.3, 1.0, 0.0), 0.5)), True, []
@@ -228,7 +230,10 @@ def noise_in_a_corner(scene, points, ray, met):
 def test_more_samples_are_taken_where_denoised_halves_differ(box):
     """As many in all as asked for, a quarter of them everywhere; the same ones every time; the mean is right."""
     pytest.importorskip("mitsuba_oidn")
-    pictures = [denoise.CleanPicture(box, box.sensors()[0], noise_in_a_corner, seed=3) for _ in range(2)]
+    pictures = [
+        denoise.CleanPicture(box.ray_intersect_preliminary, box.sensors()[0], noise_in_a_corner, seed=3)
+        for _ in range(2)
+    ]
     for picture in pictures:
         picture.take(64)
     counts = pictures[0]._taken()
@@ -246,10 +251,10 @@ def test_halves_of_pixels_are_as_many(box):
     """However many samples there are, in passes of any size."""
     pytest.importorskip("mitsuba_oidn")
 
-    def white(scene, points, ray, met):
+    def white(points, ray, met):
         return mi.Color3f(dr.select(ray.d.x > 2, 0.0, 1.0)), True, []
 
-    picture = denoise.CleanPicture(box, box.sensors()[0], white, seed=3)
+    picture = denoise.CleanPicture(box.ray_intersect_preliminary, box.sensors()[0], white, seed=3)
     taken = 0
     for spp in (5, 1, 2, 3, 7.5):
         picture._needed = None if spp < 3 else np.random.default_rng(0).random(picture._taken().shape, np.float32) + 0.1
@@ -265,7 +270,7 @@ def test_halves_of_pixels_are_as_many(box):
 def test_denoising_takes_its_share_of_the_time(box, monkeypatch):
     """The better, the more time there is; parts of pixels of enough samples only; and the last image has its time."""
     pytest.importorskip("mitsuba_oidn")
-    picture = denoise.CleanPicture(box, box.sensors()[0], None, 0)
+    picture = denoise.CleanPicture(None, box.sensors()[0], None, 0)
     (least, *_, best), fine = denoise.WAYS, [way for way in denoise.WAYS if way.parts > 1]
     monkeypatch.setattr(denoise.CleanPicture, "_pace", picture._pace / picture._takes(least))  # the cheapest: 1 s
     planned = [picture.finishing(seconds, 64) for seconds in range(60)]
@@ -395,3 +400,9 @@ def test_gallery(tmp_path, capsys):
     assert strip.shape[1] == 3 * strip.shape[0] and list((tmp_path / "work" / "references").glob("*.exr"))
     assert main(["gallery", "missing.xml", "-o", str(tmp_path)]) == 2
     assert "missing.xml" in capsys.readouterr().err
+
+
+def test_scenes_of_one_name_are_told_apart():
+    files = [SimpleNamespace(path=path) for path in ("hall/scene.xml", "attic/scene.xml", "attic/lamp.xml")]
+    titles = [gallery._title(file, files) for file in files]
+    assert titles == ["hall/scene.xml", "attic/scene.xml", "lamp.xml"]

@@ -1,8 +1,8 @@
 """A hundred and fifty random scenes and what must hold in all of them."""
 
 import mi_radiosity as mr
-from mi_radiosity.display import Field
 from mi_radiosity.scene import Model
+from mi_radiosity.solver import Field
 
 import mitsuba as mi
 import numpy as np

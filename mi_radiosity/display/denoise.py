@@ -53,8 +53,8 @@ def require_denoiser() -> Any:
 
 
 class CleanPicture:
-    """A picture [height, width, 3] of ``sample(scene, points, ray, met)`` that takes more and more samples, denoised;
-    ``met``: what rays meet first, where that is known.
+    """A picture [height, width, 3] of ``sample(points, ray, met=…)`` that takes more and more samples, denoised; met:
+    what rays meet first, as ``see(ray)`` tells, where that is known.
 
     Samples are averaged over quarters of pixels, as the denoiser needs numbers that are independent, with albedo and
     normals of the surfaces seen. The film's own filter is applied afterwards, to quarters, if there are enough samples
@@ -69,9 +69,9 @@ class CleanPicture:
     _pace = 1e-6  # seconds that the cheapest way takes per pixel; as it was last time
 
     def __init__(
-        self, scene: "mi.Scene", sensor: "mi.Sensor", sample: Callable, seed: int, draw: Callable = PixelPoints
+        self, see: Callable, sensor: "mi.Sensor", sample: Callable, seed: int, draw: Callable = PixelPoints
     ) -> None:
-        self._denoiser, self._scene, self._sensor, self._sample = require_denoiser(), scene, sensor, sample
+        self._denoiser, self._see, self._sensor, self._sample = require_denoiser(), see, sensor, sample
         film = sensor.film()
         if film.sample_border():
             raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
@@ -158,8 +158,8 @@ class CleanPicture:
 
     def _planes(self, points, ray, weight, look):
         """Radiance of samples, and if there is a ``look``, albedo and normal (Color3f [n])."""
-        met = self._scene.ray_intersect_preliminary(ray, coherent=True) if look else None
-        radiance, _, _ = self._sample(self._scene, points, ray, met=met)
+        met = self._see(ray) if look else None
+        radiance, _, _ = self._sample(points, ray, met=met)
         planes = [mi.Color3f(radiance * weight)]
         if look:
             si = met.compute_surface_interaction(ray, mi.RayFlags.All)

@@ -11,7 +11,8 @@ from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
-from ..solver import Solution, solve
+from ..scene.hit import Trail
+from ..solver import solve
 from .denoise import CleanPicture
 from .pixels import FilmPicture, grow
 from .shaders import SHADERS, Look
@@ -77,12 +78,14 @@ def _integrator_class():
                 if not 0 <= sensor < count:
                     raise RadiosityError(f"there is no sensor {sensor}: the scene has {count}, counted from 0")
                 sensor = scene.sensors()[sensor]
+            if seconds is None and spp < 1:
+                raise RadiosityError(f"spp must be 1 or more, not {spp}")
             if seconds is None and not denoise:
                 return self.render(scene, sensor, seed=seed, spp=spp)
             start = time.perf_counter()
             self.prepare(scene)
-            if denoise:  # which looks where rays meet what they are traced in
-                picture = CleanPicture(self.solution.model.rays.scene, sensor, self._sample, seed)
+            if denoise:
+                picture = CleanPicture(self._see, sensor, self._sample, seed)
             else:
                 picture = FilmPicture(scene, sensor, self._sample, seed)
             if seconds is None:
@@ -110,14 +113,18 @@ def _integrator_class():
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             self.prepare(scene)
-            return self._sample(scene, sampler, ray, active)
+            return self._sample(sampler, ray, active)
 
-        def _sample(self, scene, sampler, ray, active=True, met=None):
+        def _see(self, ray, active=True):
+            """What rays of a camera meet first."""
+            return self.solution.model.rays.seen(ray, active, lamps=not self.hide_emitters)
+
+        def _sample(self, sampler, ray, active=True, met=None):
             """What `sample` gives of a scene that is prepared; ``met``: what rays meet first, if that is known."""
             solution = self.solution
             model, rays = solution.model, solution.model.rays
             if met is None:
-                met = rays.seen(ray, active)
+                met = self._see(ray, active)
             if rays.lobes is None:
                 hit = rays.locate(met, ray.d)
             else:
@@ -126,6 +133,9 @@ def _integrator_class():
                 # The first lobe, and a line to a lamp from there, are as well spread as the ray is.
                 first = sampler.next_1d(), *sampler.next_2d(), *sampler.next_2d(), sampler.next_1d()
                 hit = rays.follow(ray.o, ray.d, number, seed, camera=True, highlights=lamps, first=first, met=met)
+                if self._shader.colors:  # no coat lies over them
+                    nearest = rays.locate(met, ray.d)
+                    hit = Trail.straight(nearest, ray.d).where(nearest.patch != NONE, hit)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
@@ -144,7 +154,8 @@ def _integrator_class():
                 radiance += model.lights.sky(direction, active & ~hit.valid) * seen * dr.inv_pi
                 valid |= active & (mi.Bool(not self.hide_emitters))
             if rays.lobes is not None:
-                radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
+                if not self._shader.colors:
+                    radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
                 valid |= active & hit.bounced
             return radiance, valid, []
 
@@ -165,10 +176,3 @@ def register(*_: object) -> None:
     """Make `radiosity` known to the active variant, and to those chosen later."""
     if mi.variant():
         mi.register_integrator("radiosity", lambda props: _integrator_class()(props))
-
-
-def render(
-    solution: Solution, sensor: "mi.Sensor | int" = 0, spp: int = 16, shading: str = "gouraud", seed: int = 0
-) -> "mi.TensorXf":
-    """Picture of ``solution`` from a sensor (or its number), [height, width, channels]."""
-    return solution.render(sensor, spp=spp, shading=shading, seed=seed)

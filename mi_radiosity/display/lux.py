@@ -35,6 +35,7 @@ class Lux(Gouraud):
     """E = 179 lm/W (0.2126 H_R + 0.7152 H_G + 0.0722 H_B), lx, from violet (0) to yellow (``scale`` and more)."""
 
     name = "lux"
+    colors = True
 
     def __init__(self, solution: Solution):
         super().__init__(solution)

@@ -85,7 +85,7 @@ def camera_rays(
 
 class FilmPicture:
     """A picture on the film of a sensor that takes more and more camera samples of
-    ``sample(scene, sampler, ray)`` (radiance, valid, …)."""
+    ``sample(sampler, ray)`` (radiance, valid, …)."""
 
     least = 1
 
@@ -102,7 +102,7 @@ class FilmPicture:
 
         for sampler in launches(self._pixels, self._done, spp, self._seed):
             ray, weight, position = ADIntegrator.sample_rays(None, self._scene, self._sensor, sampler)
-            radiance, valid, _ = self._sample(self._scene, sampler, ray)
+            radiance, valid, _ = self._sample(sampler, ray)
             block = self._film.create_block()
             block.set_coalesce(block.coalesce() and sampler.sample_count() >= 4)
             alpha = dr.select(valid, mi.Float(1), mi.Float(0))

@@ -35,6 +35,7 @@ class Shader:
 
     name = ""
     samples = False  # is more light gathered for every camera sample, so that pictures get better with time?
+    colors = False  # is what it shows no light, so that neither coats nor lamps mirrored in them belong to it?
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -109,7 +110,8 @@ class Mesh(Gouraud):
         here = local(ray.o, ray.d)
         dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
         per_pixel = dr.sqrt(dx * dx + dy * dy)
-        return look.lit & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
+        seen = look.lit & ~look.hit.bounced if self.solution.model.rays.lobes else look.lit  # not in a mirror
+        return seen & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
 
 
 class Gather(Shader):

@@ -77,8 +77,9 @@ def run_bench(
     Ours is reading, solve and pictures, with kernels warm: for a ladder of budgets, or, in a shading that samples, of
     times, denoised and not, that goes on until ours is as good as ``path`` or takes as long. ``path`` runs at 1…1024
     samples per pixel; Open Image Denoise, where it is installed, gets box-filtered pixels or quarters of them, albedo
-    and normals of both, and the film's filter comes afterwards. The camera path turns the first sensor about its place,
-    at half the resolution and a quarter of the samples.
+    and normals of both, and the film's filter comes afterwards. The camera path turns the sensor ``view`` about its
+    place, at half the resolution and a quarter of the samples; there is none of other sensors than `perspective`.
+    ``elements`` and ``rays`` are the middle of that ladder, and of one solve whose speed is told.
     """
     require_extra()
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
@@ -93,7 +94,6 @@ def run_bench(
         "elements": elements,
         "rays": rays,
         "shading": shading,
-        "views": views,
         "spp": reference_spp,
         "reference_noise": reference.noise(),
         "tracing": measure(file, elements, rays, runs),
@@ -101,9 +101,11 @@ def run_bench(
     curves = partial(_curves, model, elements, rays, shading, times)
     one = Views([model.scene.sensors()[view]], [reference.halves()])
     results["one"] = curves(path_spp, one, partial(progress, "measuring one view"))
-    if views > 1 and (many := _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress)):
+    many = _camera_path(model.scene, view, views, max(reference_spp // 8, 1), progress) if views > 1 else None
+    if many:
         fewer = [s for s in path_spp if s <= max(path_spp[-1] // 4, path_spp[0])]
         results["many"] = curves(fewer, many, partial(progress, f"measuring {views} views"))
+    results["views"] = views if many else 1
     write(output / "bench.json", json.dumps(results, indent=1) + "\n")
     write(output / "error_time.png", error_against_time(results))
     return results
@@ -127,7 +129,9 @@ def _curves(
     tracers = {"path": path_image} | ({"denoised": _denoised_path} if cleans else {})
     traced, ours = {}, {}
     for curve, trace in tracers.items():  # which have one kernel for one sample per pixel and one for more
-        traced[curve] = _points([partial(_traced, trace, scene, spp) for spp in path_spp], 2, views, progress)
+        few = CleanPicture.least if curve == "denoised" else 1
+        attempts = [partial(_traced, trace, scene, spp) for spp in path_spp if spp >= few or spp == path_spp[-1]]
+        traced[curve] = _points(attempts, 2, views, progress)
     if SHADERS.find(shading).samples:
         for curve in traced:
             attempt = partial(pictures_within, scene, shading, curve == "denoised")
@@ -222,9 +226,8 @@ def _denoised_path(scene, sensor, spp):
         return sampler
 
     start = now()
-    picture = CleanPicture(
-        scene, sensor, lambda scene, sampler, ray, met: integrator.sample(scene, sampler, ray), seed=spp, draw=draw
-    )
+    see = partial(scene.ray_intersect_preliminary, coherent=True)
+    picture = CleanPicture(see, sensor, lambda points, ray, met: integrator.sample(scene, points, ray), spp, draw)
     picture.add(spp)  # all at once, so everywhere alike
     return np.array(picture.image(picture.finishing(ROOM * (now() - start), spp)))
 
@@ -232,8 +235,8 @@ def _denoised_path(scene, sensor, spp):
 def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
     """Where another curve becomes better than ours, points joined by straight lines in log-log.
 
-    {"seconds": time from which the other is better (None if never within the times both were
-    measured), "rmse_a": the lowest error both reach, "ours_seconds", "other_seconds": when}.
+    {"seconds": time from which the other is better (None if never in the time measured, each curve keeping its last
+    error), "rmse_a": the lowest error both reach, "ours_seconds", "other_seconds": when}.
     """
 
     def curve(points):

@@ -124,7 +124,9 @@ def _gallery(arguments: argparse.Namespace) -> None:
     files = [scene_file(path, arguments.mode, definitions, arguments.plugin) for path in arguments.scene]
     shown = " ".join(str(path) for path in arguments.scene)
     command = f"mi-radiosity gallery {shown} -o {arguments.output} --seconds {arguments.seconds:g}"
-    command += f" --reference-spp {arguments.reference_spp}"
+    command += f" --reference-spp {arguments.reference_spp}" + " --denoise" * arguments.denoise
+    command += "".join(f" -D {key}={value}" for key, value in arguments.define)
+    command += "".join(f" --plugin {plugin}" for plugin in arguments.plugin)
     with progress_bars() as report:
         page = write_gallery(
             files,
@@ -133,7 +135,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
             seconds=arguments.seconds,
             reference_spp=arguments.reference_spp,
             denoise=arguments.denoise,
-            command=command + " --denoise" * arguments.denoise,
+            command=command,
             progress=report,
         )
     print(page)
@@ -176,6 +178,8 @@ def _bench(arguments: argparse.Namespace) -> None:
         f"solve: {tracing['warm_seconds']:.2f} s warm, {tracing['cold_seconds']:.1f} s cold, "
         f"{tracing['solve_over_tracing']:.2f} times tracing its rays, {tracing['peak_megabytes']:.0f} MB"
     )
+    if results["views"] < arguments.views:
+        print("no camera path: only perspective sensors turn")
     for name, title in panel_titles(results).items():
         for other, where in results[name]["crossing"].items():
             print(f"{title}: {_crossing(other, where)}")

@@ -53,9 +53,10 @@ def write_gallery(
     for number, file in enumerate(files):
         progress("scenes", number, len(files))
         row = _row(file, work, seconds, reference_spp, denoise, progress)
-        name = f"{Path(file.path).stem}.jpg"
+        scene = _title(file, files)
+        name = f"{scene.removesuffix('.xml').replace('/', '_')}.jpg"
         _write_strip(folder / name, row.pop("pictures"))
-        rows.append(row | {"name": name})
+        rows.append(row | {"scene": scene, "name": name})
     progress("scenes", len(files), len(files))
     head = HEAD.format(
         spp=reference_spp,
@@ -68,6 +69,13 @@ def write_gallery(
     with writing(output / "gallery.md") as temporary:
         Path(temporary).write_text(page, encoding="utf-8")
     return page
+
+
+def _title(file, files):
+    """The name of a scene file, with its folder if others are called the same."""
+    path = Path(file.path)
+    alone = sum(Path(other.path).stem == path.stem for other in files) == 1
+    return path.name if alone else f"{path.absolute().parent.name}/{path.name}"
 
 
 def _row(file, work, seconds, spp, denoise, progress):
@@ -96,7 +104,6 @@ def _row(file, work, seconds, spp, denoise, progress):
     truth = halves.mean(axis=0)
     difference = np.abs(srgb(image) - srgb(truth)) * TIMES_DIFFERENCE
     return {
-        "scene": Path(file.path).name,
         "seconds": taken,
         "elements": made["elements"],
         "samples": round(made["spp"]),

@@ -5,7 +5,6 @@ python -m mi_radiosity.evaluation.ladder [TRIANGLES …] [--rays N] [--variant V
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ import numpy as np
 from ..core.errors import RadiosityError
 from ..scene import Model
 from ..solver import solve
+from .records import peak_megabytes
 
 TRIANGLES = (1_000, 10_000, 100_000, 1_000_000)
 RAYS = 10_000_000
@@ -109,7 +109,7 @@ def climb(triangles: int, rays: int) -> dict[str, Any]:
         "rays": solution.stats["rays"],
         "read_seconds": read,
         "solve_seconds": total - read,
-        "megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "megabytes": peak_megabytes(),
     }
 
 

@@ -2,6 +2,7 @@
 
 import json
 import statistics
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypedDict, cast
@@ -100,6 +101,15 @@ def write(path: Path, data: str | bytes) -> None:
     """Write a file whole or not at all."""
     with writing(path) as temporary:
         Path(temporary).write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def peak_megabytes() -> float:
+    """The most memory that this process has had; not a number where the system does not tell."""
+    if sys.platform == "win32":
+        return float("nan")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def make_folder(path: Path) -> None:

@@ -3,7 +3,6 @@
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from ..scene import Model
 from ..scene.rays import Rays
 from ..solver import solve
 from ..transport import Gathering
+from .records import peak_megabytes
 from .scenes import SceneFile, scene_file
 
 FEW = 32  # entries of a kernel that may be for scalars
@@ -63,7 +63,7 @@ def measure(file: SceneFile, elements: int, rays: int, runs: int = 7) -> dict[st
     patches = solve(scene, elements=elements, rays=rays).stats["patches"]
     cold = _cold_seconds(file, elements, rays)
     compiled = _later_kernels(scene, max(patches, elements), patches, rays)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = peak_megabytes()
     recorder, stats = record(scene, elements, rays)
     recorder.replay()
     solves, traces = [], []

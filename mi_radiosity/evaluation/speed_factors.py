@@ -1,7 +1,6 @@
 """What view factors and relighting cost: `python -m mi_radiosity.evaluation.speed_factors SCENE`."""
 
 import argparse
-import resource
 import statistics
 import time
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ from typing import Any
 from ..scene import Model
 from ..solver import solve
 from ..transport import ViewFactors, view_factors
+from .records import peak_megabytes
 from .scenes import SceneFile, scene_file
 from .speed import Recorder, _clock
 
@@ -36,7 +36,7 @@ def measure(file: SceneFile, elements: int, rays: int) -> dict[str, Any]:
     before = time.process_time()
     seconds = _clock(lambda: found.append(solution.view_factors("leaf", rays=rays)))
     cpu = time.process_time() - before
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = peak_megabytes()
     factors = found.pop()
     figures = {"facets": len(factors.areas), "entries": factors.F.nnz} | {
         k: factors.stats[k] for k in ("rays", "lines")

@@ -44,7 +44,7 @@ def export(
     written.
     """
     path, report = Path(path), progress or (lambda stage, done, total: None)
-    exposure = checked(exposure)
+    exposure = checked(exposure, path)
     check_target(path)
     report("export", 0, 2)
     mesh = lit_mesh(solution)

@@ -36,7 +36,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from .api import check_target, export
     from .tone import checked
 
-    checked(arguments.exposure)
+    checked(arguments.exposure, arguments.output)
     if arguments.lightmap is not None:
         bake(arguments)
         return

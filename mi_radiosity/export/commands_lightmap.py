@@ -23,7 +23,8 @@ def lightmap_arguments(parser: argparse.ArgumentParser) -> None:
 def refuse_without_lightmap(arguments: argparse.Namespace) -> None:
     """Raise RadiosityError for options of a lightmap where none is asked for."""
     for name in ("samples", "denoise", "unlit", "seed"):
-        if getattr(arguments, name):
+        value = getattr(arguments, name)
+        if value is not None and value is not False:
             raise RadiosityError(f"--{name} belongs to a lightmap: add --lightmap SIZE, or leave it out")
 
 

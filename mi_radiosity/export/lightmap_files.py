@@ -45,7 +45,8 @@ def export_lightmap(
     the light as `MOZ_lightmap`. exposure: a number, or "auto". samples, denoise, progress: see `lightmap`.
     Raises RadiosityError for another name, and for a file that cannot be written.
     """
-    path, exposure = Path(path), checked(exposure)
+    path = Path(path)
+    exposure = checked(exposure, path)
     check_target(path, unlit)
     found = lightmap(solution, size, samples, denoise, seed, progress)
     if path.suffix.lower() == ".exr":

@@ -1,5 +1,6 @@
 """From radiance to what screens and viewers take."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,19 +10,23 @@ from ..core.errors import RadiosityError
 if TYPE_CHECKING:
     from .geometry import LitMesh
 
+HOLD_LIGHT = (".xml", ".exr")  # such files are not made of colours
 BRIGHT = 0.98  # share of the lit area that the exposure "auto" shows without clipping
 
 
-def checked(exposure: float | str) -> float | str:
-    """A number > 0, or "auto". Raises RadiosityError for anything else."""
-    if exposure == "auto":
-        return "auto"
-    try:
-        value = float(exposure)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
+def checked(exposure: float | str, path: Path | None = None) -> float | str:
+    """A number > 0, or "auto". Raises RadiosityError for anything else, and if the file at ``path`` holds light, which
+    has no exposure."""
+    value: float | str = "auto"
+    if exposure != "auto":
+        try:
+            value = float(exposure)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < float("inf"):
+            raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
+    if value != 1 and path is not None and path.suffix.lower() in HOLD_LIGHT:
+        raise RadiosityError(f"-o {path}: --exposure is for colours, and this file holds light: leave it out")
     return value
 
 

@@ -75,5 +75,9 @@ class Trail:
         dr.scatter(row, dr.arange(mi.UInt32, dr.width(rows)), rows)
         dr.eval(others)
         there = row != NONE
-        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
-        return Trail(*(dr.select(there, dr.gather(type(b), b, row, there), a) for a, b in pairs))
+        gathered = (dr.gather(type(x), x, row, there) for x in (getattr(others, f.name) for f in fields(self)))
+        return Trail(*gathered).where(there, self)
+
+    def where(self, which: "mi.Bool", other: "Trail") -> "Trail":
+        """These ends where ``which``, elsewhere the ``other`` ones."""
+        return Trail(*(dr.select(which, getattr(self, f.name), getattr(other, f.name)) for f in fields(self)))

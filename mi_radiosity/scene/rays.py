@@ -5,8 +5,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from ..core.arrays import NONE, owned_vectors
+from ..core.arrays import NONE, owned, owned_vectors
 from ..core.points import cosine_direction
 from .faces import Faces
 from .hit import Hit, Trail
@@ -27,6 +28,7 @@ class Rays:
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
+        self._shines = np.array([part.shape.is_emitter() for part in faces.parts])
 
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
@@ -52,9 +54,24 @@ class Rays:
         """Nearest intersections of rays (Point3f, Vector3f [rays])."""
         return self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
 
-    def seen(self, ray: "mi.Ray3f", active: "mi.Bool | bool" = True) -> "mi.PreliminaryIntersection3f":
-        """Nearest intersections of a camera's rays, which keep together and may have an end."""
-        return self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    def seen(
+        self, ray: "mi.Ray3f", active: "mi.Bool | bool" = True, lamps: bool = True
+    ) -> "mi.PreliminaryIntersection3f":
+        """Nearest intersections of a camera's rays, which keep together and may have an end; with what is behind
+        ``lamps`` if these are not to be seen."""
+        met = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        if lamps or not self._shines.any():
+            return met
+        shines, ray = owned(mi.UInt32, self._shines), mi.Ray3f(ray)
+
+        def on_lamp(met, _):
+            return met.is_valid() & (dr.gather(mi.UInt32, shines, met.shape_index, met.is_valid()) != 0)
+
+        def past(met, ray):
+            ray = met.compute_surface_interaction(ray, mi.RayFlags.Minimal).spawn_ray(ray.d)
+            return self.scene.ray_intersect_preliminary(ray, coherent=True), ray
+
+        return dr.while_loop((met, ray), on_lamp, past)[0]
 
     def locate(self, prelim: "mi.PreliminaryIntersection3f", direction: "mi.Vector3f") -> Hit:
         """Name the patches that intersections lie on."""

@@ -78,7 +78,7 @@ def parts(scene: "mi.Scene") -> list[Part]:
         matrix = transform_of(shape)
         for k, member in enumerate(m for m in members if isinstance(m, mi.Shape)):
             found.append(
-                Part(member, number, f"{label(member, k)} of {part.name.replace('shape', 'instance')}", matrix)
+                Part(member, number, f"{label(member, k)} of {part.name.replace('shape', 'instance', 1)}", matrix)
             )
         if not members:
             found.append(part)

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -279,8 +280,8 @@ class Solution:
 
         Raises RadiosityError if the file is no solution, or is damaged.
         """
-        data, _ = _read(path)
-        return json.loads(str(data["source"])) if "source" in data else None
+        with _archive(path) as file:
+            return json.loads(str(file["source"])) if "source" in file else None
 
     @staticmethod
     def load(path: str | os.PathLike[str], scene: "mi.Scene | Model") -> "Solution":
@@ -322,15 +323,22 @@ class Solution:
 
 def _read(path):
     """The arrays and the statistics in a file."""
-    try:
-        with np.load(path) as file:
-            data = {name: file[name] for name in file.files}
-        if int(data["format"]) != FORMAT:
-            raise RadiosityError(f"{path} was written by another version: solve the scene again")
+    with _archive(path) as file:
+        data = {name: file[name] for name in file.files}
         layers = [f"layers_{name}" for name in ARRAYS] if "lamps" in data else []
         for name in ("fingerprint", "sides", "landings", *TREE, *EXPOSURE, *COLORS, *layers):
             data[name]
         return data, json.loads(str(data["stats"]))
+
+
+@contextmanager
+def _archive(path):
+    """What `save` has written, whose arrays are read when they are asked for."""
+    try:
+        with np.load(path) as file:
+            if int(file["format"]) != FORMAT:
+                raise RadiosityError(f"{path} was written by another version: solve the scene again")
+            yield file
     except FileNotFoundError:
         raise RadiosityError(f"{path} does not exist: save a solution first") from None
     except RadiosityError:

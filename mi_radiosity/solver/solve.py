@@ -42,8 +42,9 @@ def solve(
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: elements wanted, reached to within 3, or less where patches share and the oracle finds nothing left to
     split; or epsilon: the ε of the oracle. Without either, 19,000 more than the scene has patches, but 114,000 at most,
-    unless the oracle finds less to refine. Where there are to be fewer elements than patches, clusters of patches are
-    elements (`Crown`): they share one irradiance and one set of pairs, and the oracle splits them. rays: rays that
+    unless the oracle finds less to refine. Where there are to be fewer elements than patches, or hardly more than there
+    are of many (by default, of more than 95,000), clusters of patches are elements (`Crown`): they share one irradiance
+    and one set of pairs, and the oracle splits them. rays: rays that
     carry the power and gather it, used exactly; by default 300 for each of the first 19,000 elements, and 20 for each
     of all, as light, not tessellation, decides what is needed; twice as many where lamps cast sharp shadows and are no
     surfaces. lines: random lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
