@@ -45,7 +45,7 @@ def box(material):
     parts = mi.cornell_box()
     del parts["integrator"]
     parts["sensor"]["film"] |= {"width": 48, "height": 48, "rfilter": {"type": "box"}}
-    bsdf = MATERIALS.get(material, DIFFUSE)
+    bsdf = {"diffuse": DIFFUSE, **MATERIALS}[material]
     parts["large-box"]["bsdf"] = bsdf if material in TRANSPARENT else {"type": "twosided", "bsdf": bsdf}
     return mi.load_dict(parts)
 

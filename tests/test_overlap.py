@@ -108,6 +108,22 @@ def test_finds_every_pair(seed):
     assert len(deep) > 20 and deep <= found <= some
 
 
+def test_finds_what_lies_on_few_large_faces():
+    """Whose grid is finer than they are large: of thousands of small faces each finds the one that it is on, if it is
+    in its plane."""
+    random, count = np.random.default_rng(3), 3000
+    half = np.array([[[0, 0], [1, 0], [0, 1]], [[1, 1], [0, 1], [1, 0]]], dtype=float)
+    on, level = random.integers(0, 2, count), random.integers(0, 2, count)
+    weight = random.dirichlet([1, 1, 1], count) * 0.9 + 1 / 30  # off the sides
+    middle = np.einsum("nk,nkx->nx", weight, half[on])
+    flat = np.concatenate([half, middle[:, None] + 0.003 * random.normal(size=(count, 3, 2))])
+    height = np.concatenate([[0, 0], 0.01 * level])
+    corners = np.concatenate([flat, np.broadcast_to(height[:, None, None], (count + 2, 3, 1))], axis=2)
+    corners = corners @ np.linalg.qr(random.normal(size=(3, 3)))[0].T
+    found = {pair for pair in found_pairs(corners, 1e-6) if pair[0] < 2}
+    assert found == {(int(on[k]), k + 2) for k in np.flatnonzero(level == 0)}
+
+
 def test_owners_of_points_under_many_faces():
     """A point belongs to the uppermost face it lies on, of thousands on two others of any shape and place, whichever
     of them share the cell it is in."""

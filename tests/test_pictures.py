@@ -403,6 +403,9 @@ def test_gallery(tmp_path, capsys):
 
 
 def test_scenes_of_one_name_are_told_apart():
-    files = [SimpleNamespace(path=path) for path in ("hall/scene.xml", "attic/scene.xml", "attic/lamp.xml")]
-    titles = [gallery._title(file, files) for file in files]
-    assert titles == ["hall/scene.xml", "attic/scene.xml", "lamp.xml"]
+    def titles(*paths):
+        return gallery._titles([SimpleNamespace(path=path) for path in paths])
+
+    assert titles("hall/scene.xml", "attic/lamp.xml") == ["scene.xml", "lamp.xml"]
+    assert titles("hall/scene.xml", "attic/scene.xml") == ["hall/scene.xml", "attic/scene.xml"]
+    assert titles("a/hall/scene.xml", "b/hall/scene.xml") == ["a/hall/scene.xml", "b/hall/scene.xml"]

@@ -29,7 +29,8 @@ def _integrator_class():
         Displays a radiosity solution: L = (E + ρ H) / π, with ρ looked up at the pixel.
 
         Parameters: ``oracle`` (NAME or NAME:PARAMETER), ``alpha``, ``elements``, ``epsilon``, ``rays``, ``lines``,
-        ``seed`` as in `solve`; ``shading``: the name of a shader, ``gouraud`` (default), ``flat``, ``mesh``, …
+        ``seed`` as in `solve`; ``shading``: the name of a shader, ``gouraud`` (default), ``flat``, ``mesh``, …; and
+        ``hide_emitters`` as Mitsuba's integrators have it.
 
         The scene is solved at its first picture and not again until it, or a parameter, changes.
         """
@@ -133,9 +134,9 @@ def _integrator_class():
                 # The first lobe, and a line to a lamp from there, are as well spread as the ray is.
                 first = sampler.next_1d(), *sampler.next_2d(), *sampler.next_2d(), sampler.next_1d()
                 hit = rays.follow(ray.o, ray.d, number, seed, camera=True, highlights=lamps, first=first, met=met)
-                if self._shader.colors:  # no coat lies over them
-                    nearest = rays.locate(met, ray.d)
-                    hit = Trail.straight(nearest, ray.d).where(nearest.patch != NONE, hit)
+                if self._shader.colors:  # no coat lies over them, but where rays go on straight they do
+                    nearest, on = rays.locate(met, ray.d), hit.straight_on(ray.d)
+                    hit = Trail.straight(nearest, ray.d).where((nearest.patch != NONE) & ~on, hit)
             valid = hit.valid & active
             lit = valid & (hit.patch != NONE)
             leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)

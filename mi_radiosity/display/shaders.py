@@ -110,7 +110,8 @@ class Mesh(Gouraud):
         here = local(ray.o, ray.d)
         dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
         per_pixel = dr.sqrt(dx * dx + dy * dy)
-        seen = look.lit & ~look.hit.bounced if self.solution.model.rays.lobes else look.lit  # not in a mirror
+        lobes = self.solution.model.rays.lobes is not None
+        seen = look.lit & look.hit.straight_on(ray.d) if lobes else look.lit  # not in a mirror
         return seen & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
 
 

@@ -128,7 +128,7 @@ def _curves(
     scene, cleans = model.scene, _denoiser_is_there()
     tracers = {"path": path_image} | ({"denoised": _denoised_path} if cleans else {})
     traced, ours = {}, {}
-    for curve, trace in tracers.items():  # which have one kernel for one sample per pixel and one for more
+    for curve, trace in tracers.items():  # of which `path` has one kernel for one sample per pixel and one for more
         few = CleanPicture.least if curve == "denoised" else 1
         attempts = [partial(_traced, trace, scene, spp) for spp in path_spp if spp >= few or spp == path_spp[-1]]
         traced[curve] = _points(attempts, 2, views, progress)

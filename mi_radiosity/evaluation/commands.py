@@ -1,6 +1,7 @@
-"""mi-radiosity reference, compare and bench."""
+"""mi-radiosity reference, compare, bench and gallery."""
 
 import argparse
+import shlex
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -122,11 +123,11 @@ def _gallery(arguments: argparse.Namespace) -> None:
         require_denoiser()
     definitions = dict(arguments.define)
     files = [scene_file(path, arguments.mode, definitions, arguments.plugin) for path in arguments.scene]
-    shown = " ".join(str(path) for path in arguments.scene)
-    command = f"mi-radiosity gallery {shown} -o {arguments.output} --seconds {arguments.seconds:g}"
-    command += f" --reference-spp {arguments.reference_spp}" + " --denoise" * arguments.denoise
-    command += "".join(f" -D {key}={value}" for key, value in arguments.define)
-    command += "".join(f" --plugin {plugin}" for plugin in arguments.plugin)
+    command = ["mi-radiosity", "gallery", *map(str, arguments.scene), "-o", str(arguments.output)]
+    command += ["--seconds", f"{arguments.seconds:g}", "--reference-spp", str(arguments.reference_spp)]
+    command += ["--denoise"] * arguments.denoise + ["-m", arguments.mode] * (arguments.mode != "llvm_ad_rgb")
+    for option, values in (("-D", map("=".join, arguments.define)), ("--plugin", arguments.plugin)):
+        command += [part for value in values for part in (option, str(value))]
     with progress_bars() as report:
         page = write_gallery(
             files,
@@ -135,7 +136,7 @@ def _gallery(arguments: argparse.Namespace) -> None:
             seconds=arguments.seconds,
             reference_spp=arguments.reference_spp,
             denoise=arguments.denoise,
-            command=command,
+            command=shlex.join(command),
             progress=report,
         )
     print(page)

@@ -50,13 +50,12 @@ def write_gallery(
     for path in (folder, work):
         make_folder(path)
     rows = []
-    for number, file in enumerate(files):
+    for number, (file, title) in enumerate(zip(files, _titles(files))):
         progress("scenes", number, len(files))
         row = _row(file, work, seconds, reference_spp, denoise, progress)
-        scene = _title(file, files)
-        name = f"{scene.removesuffix('.xml').replace('/', '_')}.jpg"
+        name = f"{title.removesuffix('.xml').replace('/', '__')}.jpg"
         _write_strip(folder / name, row.pop("pictures"))
-        rows.append(row | {"scene": scene, "name": name})
+        rows.append(row | {"scene": title, "name": name})
     progress("scenes", len(files), len(files))
     head = HEAD.format(
         spp=reference_spp,
@@ -71,11 +70,11 @@ def write_gallery(
     return page
 
 
-def _title(file, files):
-    """The name of a scene file, with its folder if others are called the same."""
-    path = Path(file.path)
-    alone = sum(Path(other.path).stem == path.stem for other in files) == 1
-    return path.name if alone else f"{path.absolute().parent.name}/{path.name}"
+def _titles(files):
+    """Names of scene files, with as many of their folders as tell them apart."""
+    paths = [Path(file.path).absolute().parts for file in files]
+    length = next((n for n in range(1, max(map(len, paths))) if len({p[-n:] for p in paths}) == len(paths)), 0)
+    return ["/".join(path[-length:]) for path in paths]
 
 
 def _row(file, work, seconds, spp, denoise, progress):

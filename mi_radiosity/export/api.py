@@ -40,8 +40,8 @@ def export(
     """Write the lit mesh of a solution as .ply, .glb or .xml, as the name says.
 
     exposure: what radiance is multiplied by for colours, a number or "auto"; 1 shows what a picture in .png shows.
-    progress: called with ("export", done, total). Raises RadiosityError for another name, and for a file that cannot be
-    written.
+    progress: called with ("export", done, total). Raises RadiosityError for another name, for a file that cannot be
+    written, and for an exposure of one that holds light (.xml).
     """
     path, report = Path(path), progress or (lambda stage, done, total: None)
     exposure = checked(exposure, path)

@@ -43,7 +43,7 @@ def export_lightmap(
 
     unlit: a scene whose texture is exposure × radiance, which every viewer shows, instead of one whose materials have
     the light as `MOZ_lightmap`. exposure: a number, or "auto". samples, denoise, progress: see `lightmap`.
-    Raises RadiosityError for another name, and for a file that cannot be written.
+    Raises RadiosityError for another name, for a file that cannot be written, and for an exposure of irradiance (.exr).
     """
     path = Path(path)
     exposure = checked(exposure, path)

@@ -26,7 +26,7 @@ def checked(exposure: float | str, path: Path | None = None) -> float | str:
         if not 0 < value < float("inf"):
             raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
     if value != 1 and path is not None and path.suffix.lower() in HOLD_LIGHT:
-        raise RadiosityError(f"-o {path}: --exposure is for colours, and this file holds light: leave it out")
+        raise RadiosityError(f"{path} holds light, which has no exposure: leave that out")
     return value
 
 

@@ -7,6 +7,8 @@ import mitsuba as mi
 
 from ..core.arrays import NONE
 
+STRAIGHT = 1 - 1e-6  # cosine of an angle that is none
+
 
 @dataclass
 class Hit:
@@ -68,6 +70,10 @@ class Trail:
             share=nought + 1,
             rough=no,
         )
+
+    def straight_on(self, direction: "mi.Vector3f") -> "mi.Bool":
+        """Have rays along directions kept them (Bool [rays])? Through masks and thin glass they do."""
+        return dr.dot(self.direction, direction) > STRAIGHT * dr.norm(self.direction) * dr.norm(direction)
 
     def replaced(self, rows: "mi.UInt32", others: "Trail") -> "Trail":
         """These ends, but in some rows (UInt32) those of ``others``."""

@@ -13,7 +13,7 @@ from .lookup import EDGE, Lookup, barycentric
 CHUNK = 1 << 21  # candidate pairs tested at a time: bounds memory
 GUESS = 12  # pairs of faces that are near each other, per face
 FINEST = 30  # a grid has up to 2^30 cells along an axis
-LOOKERS, FINER = 2, 4  # a cell is halved up to 4 times, where 2, 8, 32 … faces look for one that is there
+LOOKERS, FINER = 2, 4  # a cell is halved up to 4 times, where 8, 32, 128, 512 faces look for one that is there
 ABOUT = 0.999  # of the area of another face: as large, to float32
 LATTICE = 8  # points along a side that show whether a face is covered
 
@@ -105,8 +105,9 @@ def coplanar_pairs(
         ends = [dr.gather(mi.UInt32, x, part) for x in (f, g)]
         meet = dr.compress(faces.meet(*ends))
         found.append(np.column_stack([chosen[np.array(dr.gather(mi.UInt32, x, meet))] for x in ends]))
-    pairs = np.concatenate(found)
-    return np.unique(np.concatenate([pairs, pairs[:, ::-1]]), axis=0).T
+    f, g = np.concatenate(found).T
+    rows = np.unique(np.concatenate([f << 32 | g, g << 32 | f]))
+    return np.array([rows >> 32, rows & 0xFFFFFFFF])
 
 
 class _Triangles:
@@ -205,10 +206,12 @@ class _Grid:
     def __init__(self, triangles: _Triangles) -> None:
         self._triangles = triangles
         levels, own, there = np.unique(triangles.level, return_inverse=True, return_counts=True)
-        finer = np.clip(np.log2(np.cumsum(there) / (LOOKERS * there)) // 2, 0, FINER)
+        looking = np.cumsum(there)
+        finer = np.clip(np.log2(looking / (LOOKERS * there)) // 2, 0, FINER)
+        usual = levels[np.searchsorted(looking, looking // 2)]  # half of those that look are no larger
         self._first = owned(mi.UInt32, own)  # grid of a face
         self._grids = opaque_index(len(levels))
-        self._scale = owned(mi.Float64, 2.0 ** -np.maximum(levels - finer, levels[0]))
+        self._scale = owned(mi.Float64, 2.0 ** -np.maximum(levels - finer, usual))
         bits = len(own).bit_length() + 1
         self._shift = opaque_index(32 - bits)
         low, high = (np.array(x, dtype=np.int64) for x in self._cells(dr.arange(mi.UInt32, len(own)), self._first))

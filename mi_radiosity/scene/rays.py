@@ -28,7 +28,8 @@ class Rays:
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
         self.overlaps = overlaps
-        self._shines = np.array([part.shape.is_emitter() for part in faces.parts])
+        shines = np.array([part.shape.is_emitter() for part in faces.parts])[faces.shape]
+        self._shines = owned(mi.UInt32, shines) if shines.any() else None
 
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
@@ -57,28 +58,39 @@ class Rays:
     def seen(
         self, ray: "mi.Ray3f", active: "mi.Bool | bool" = True, lamps: bool = True
     ) -> "mi.PreliminaryIntersection3f":
-        """Nearest intersections of a camera's rays, which keep together and may have an end; with what is behind
-        ``lamps`` if these are not to be seen."""
+        """Nearest intersections of a camera's rays, which keep together and may have an end. lamps: if False, rays pass
+        through lamps that are surfaces, and have no end behind them, as Mitsuba's."""
         met = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        if lamps or not self._shines.any():
+        if lamps or self._shines is None:
             return met
-        shines, ray = owned(mi.UInt32, self._shines), mi.Ray3f(ray)
 
-        def on_lamp(met, _):
-            return met.is_valid() & (dr.gather(mi.UInt32, shines, met.shape_index, met.is_valid()) != 0)
+        def on_lamp(met, ray):
+            valid, face = self._face_met(met)
+            if self.overlaps:  # the lamp is on top, whichever is met
+                face, *_ = self.overlaps.owner(
+                    face, self._from_behind(face, ray.d, valid), met.prim_uv.x, met.prim_uv.y, valid
+                )
+            return valid & (dr.gather(mi.UInt32, self._shines, face, valid) != 0)
 
         def past(met, ray):
             ray = met.compute_surface_interaction(ray, mi.RayFlags.Minimal).spawn_ray(ray.d)
             return self.scene.ray_intersect_preliminary(ray, coherent=True), ray
 
-        return dr.while_loop((met, ray), on_lamp, past)[0]
+        return dr.while_loop((met, mi.Ray3f(ray)), on_lamp, past)[0]
+
+    def _face_met(self, prelim):
+        """Is there an intersection, and the face that it lies on (Bool, UInt32 [n])."""
+        valid = prelim.is_valid()
+        return valid, dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
+
+    def _from_behind(self, face, direction, valid):
+        """Do rays meet the backs of faces (Bool [n])?"""
+        return dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
 
     def locate(self, prelim: "mi.PreliminaryIntersection3f", direction: "mi.Vector3f") -> Hit:
         """Name the patches that intersections lie on."""
-        valid = prelim.is_valid()
-        face = dr.gather(mi.UInt32, self._first_face, prelim.shape_index, valid) + prelim.prim_index
-        back = dr.dot(dr.gather(mi.Vector3f, self.front, face, valid), direction) > 0
-        return self.side(face, back, prelim.prim_uv.x, prelim.prim_uv.y, valid)
+        valid, face = self._face_met(prelim)
+        return self.side(face, self._from_behind(face, direction, valid), prelim.prim_uv.x, prelim.prim_uv.y, valid)
 
     def side(self, face: "mi.UInt32", back: "mi.Bool", u: "mi.Float", v: "mi.Float", valid: "mi.Bool") -> Hit:
         """Name the patches of points (u, v) of faces, on their backs where ``back``."""

@@ -278,7 +278,7 @@ class Solution:
     def source_of(path: str | os.PathLike[str]) -> dict | None:
         """Where the scene of a kept solution came from, as `save` was told; None if it was not.
 
-        Raises RadiosityError if the file is no solution, or is damaged.
+        Raises RadiosityError if the file is no solution, or damaged as far as this is read.
         """
         with _archive(path) as file:
             return json.loads(str(file["source"])) if "source" in file else None

@@ -42,18 +42,17 @@ def solve(
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
     elements: elements wanted, reached to within 3, or less where patches share and the oracle finds nothing left to
     split; or epsilon: the ε of the oracle. Without either, 19,000 more than the scene has patches, but 114,000 at most,
-    unless the oracle finds less to refine. Where there are to be fewer elements than patches, or hardly more than there
-    are of many (by default, of more than 95,000), clusters of patches are elements (`Crown`): they share one irradiance
-    and one set of pairs, and the oracle splits them. rays: rays that
-    carry the power and gather it, used exactly; by default 300 for each of the first 19,000 elements, and 20 for each
-    of all, as light, not tessellation, decides what is needed; twice as many where lamps cast sharp shadows and are no
-    surfaces. lines: random lines S per pair for the oracle. seed: any integer; the same seed gives the same solution.
-    transport, pilot: how power is carried over the finished mesh, and while it grows; `Gathering()` and `PILOT` by
-    default, while `Shooting()` shoots it only. layers: keep the light of every lamp by itself, for `Solution.relight`;
-    the rays are shared out by the lamps' power. seconds: choose elements and rays, where they are not given, so that it
-    takes about so long, reading the scene and all; from then on more of them would go into pictures with more profit
-    (see `afford`). progress: called with (stage, done, total), stage being "refine" or
-    "distribute" (total is None where it is not known).
+    unless the oracle finds less to refine. Where there are to be fewer elements than patches, or hardly more, if there
+    are many (by default if more than 95,000), clusters of patches are elements (`Crown`): they share one irradiance and
+    one set of pairs, and the oracle splits them. rays: rays that carry the power and gather it, used exactly; by
+    default 300 for each of the first 19,000 elements, and 20 for each of all, as light, not tessellation, decides what
+    is needed; twice as many where lamps cast sharp shadows and are no surfaces. lines: random lines S per pair for the
+    oracle. seed: any integer; the same seed gives the same solution. transport, pilot: how power is carried over the
+    finished mesh, and while it grows; `Gathering()` and `PILOT` by default, while `Shooting()` shoots it only. layers:
+    keep the light of every lamp by itself, for `Solution.relight`; the rays are shared out by the lamps' power.
+    seconds: choose elements and rays, where they are not given, so that it takes about so long, reading the scene and
+    all; from then on more of them would go into pictures with more profit (see `afford`). progress: called with
+    (stage, done, total), stage being "refine" or "distribute" (total is None where it is not known).
 
     Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements. Raises RadiosityError for
     options and scenes that cannot be used.
