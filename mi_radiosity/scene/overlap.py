@@ -208,10 +208,10 @@ class _Grid:
         levels, own, there = np.unique(triangles.level, return_inverse=True, return_counts=True)
         looking = np.cumsum(there)
         finer = np.clip(np.log2(looking / (LOOKERS * there)) // 2, 0, FINER)
-        usual = levels[np.searchsorted(looking, looking // 2)]  # half of those that look are no larger
+        usual = levels[np.searchsorted(looking, looking // 2)]  # half of those that look are larger, or as large
         self._first = owned(mi.UInt32, own)  # grid of a face
         self._grids = opaque_index(len(levels))
-        self._scale = owned(mi.Float64, 2.0 ** -np.maximum(levels - finer, usual))
+        self._scale = owned(mi.Float64, 2.0 ** -np.maximum(levels - finer, np.minimum(levels, usual)))
         bits = len(own).bit_length() + 1
         self._shift = opaque_index(32 - bits)
         low, high = (np.array(x, dtype=np.int64) for x in self._cells(dr.arange(mi.UInt32, len(own)), self._first))
@@ -280,9 +280,8 @@ class _Grid:
         """Does the box that two faces share begin in this cell of several that both are in (Bool [n])?"""
         scale, here = dr.gather(mi.Float64, self._scale, grid), mi.Bool(True)
         for low, c in zip(self._triangles.low, cell):
-            here &= (
-                mi.UInt32(mi.Int32(dr.maximum(*(dr.gather(mi.Float64, low, x) for x in (face, other))) * scale)) == c
-            )
+            begin = dr.maximum(*(dr.gather(mi.Float64, low, x) for x in (face, other)))
+            here &= mi.UInt32(mi.Int32(begin * scale)) == c
         return here
 
     def _cells(self, face, grid):
