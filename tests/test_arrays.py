@@ -13,6 +13,7 @@ from mi_radiosity.core.arrays import (
     owned,
     owned_vectors,
     power_of_two,
+    runs,
     totals,
     unique,
 )
@@ -382,3 +383,9 @@ def test_components_of_a_long_chain():
     order = np.random.default_rng(4).permutation(n)
     assert len(set(components(n, order[:-1], order[1:]).tolist())) == 1
     assert len(set(components(n, np.array([], int), np.array([], int)).tolist())) == n
+
+
+def test_runs():
+    run, place = runs(np.array([2, 0, 3]))
+    assert run.tolist() == [0, 0, 2, 2, 2] and place.tolist() == [0, 1, 0, 1, 2]
+    assert [len(x) for x in runs(np.array([], dtype=int))] == [0, 0]

@@ -1,15 +1,12 @@
-"""Pictures that grow: within a time, denoised, of rough metal; and a gallery of them."""
+"""Pictures that grow: within a time, and denoised."""
 
 import re
-from types import SimpleNamespace
 
 import mi_radiosity as mr
 from mi_radiosity.cli import main
 from mi_radiosity.display import denoise, pixels
 from mi_radiosity.display.image import write_image
-from mi_radiosity.evaluation import gallery
 from mi_radiosity.scene import Model
-from mi_radiosity.scene.lobes import Lobes
 from mi_radiosity.solver import cost
 from mi_radiosity.transport import Gatherer
 from mi_radiosity.transport.gather import Found
@@ -19,7 +16,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from conftest import diffuse, lamp, rectangle, scene
-from scipy import stats
 
 BOX = "scenes_xml/cornell_box.xml"
 T = mi.ScalarTransform4f
@@ -287,74 +283,6 @@ def test_what_is_brighter_than_white_is_white_in_a_png(tmp_path):
     assert dark == 0 and half in (187, 188) and white == 255 and bright == [[255, 255, 255]]
 
 
-# ---- Rough metal -----------------------------------------------------------------------------------
-
-
-def plate(lamp):
-    film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
-    look = T().look_at([-1.5, 0, 1.0], [0, 0, 0], [0, 0, 1])
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "camera": {"type": "perspective", "fov": 60, "to_world": look, "film": film},
-            "plate": rectangle(bsdf={"type": "roughconductor", "alpha": 0.2}),
-            "wall": rectangle(T().translate([1, 0, 1]).rotate([0, 1, 0], -90), bsdf=diffuse(0.5)),
-            "lamp": lamp,
-        }
-    )
-
-
-LAMPS = {
-    "area": rectangle(
-        T().translate([0.4, 0, 1.2]).rotate([1, 0, 0], 180).scale(0.1), bsdf=diffuse(0), emitter=lamp(300)
-    ),
-    "point": {"type": "point", "position": [0.4, 0, 1.2], "intensity": 3.0},
-    "sky": {"type": "constant", "radiance": 0.5},
-}
-
-
-@pytest.mark.parametrize("name", LAMPS)
-def test_rough_metal_mirrors_lamps_as_path_sees_them(name):
-    truth = plate(LAMPS[name])
-    solution = mr.solve(truth, rays=200_000)
-    ours, theirs = (
-        np.array([np.array(image)[..., :3] for image in images])
-        for images in (
-            [solution.render(spp=64, shading="gather", seed=seed) for seed in range(6)],
-            [mi.render(truth, integrator=mi.load_dict(PATH), spp=256, seed=seed) for seed in range(6)],
-        )
-    )
-    (a, e), (b, f) = ((x.mean(), x.mean(axis=(1, 2, 3)).std(ddof=1) / 6**0.5) for x in (ours, theirs))
-    assert abs(a - b) < 4 * np.hypot(e, f) + 0.01 * b
-
-
-def test_lines_from_rough_metal_take_its_noise_away():
-    """A third of the noise that the lobe's own rays have, at as many samples."""
-    solution = mr.solve(plate(LAMPS["area"]), mr.Uniform(), elements=500, rays=100_000)
-    noise = []
-    for highlights in (solution.gatherer.highlights, None):
-        solution.gatherer.highlights = highlights
-        noise.append(np.std([solution.render(spp=16, shading="gather", seed=seed) for seed in range(6)], axis=0).mean())
-    assert noise[0] < noise[1] / 3
-
-
-def test_first_lobes_are_as_well_spread_as_camera_rays(monkeypatch):
-    """Plates of a rough lobe under a lamp, 64 samples: beside lobes drawn independently the variance between seeds is
-    smaller, by an F-test with the pixels' own degrees of freedom at the level of 1e-4; the mean is the same."""
-    solution, follow = mr.solve(plate(LAMPS["area"]), mr.Uniform(), elements=500, rays=100_000), Lobes.follow
-
-    def variance():
-        images = np.array([solution.render(spp=64, shading="gather", seed=seed)[..., 1] for seed in range(8)])
-        return images.var(axis=0, ddof=1), images.mean(axis=(1, 2))
-
-    spread, mean = variance()
-    monkeypatch.setattr(Lobes, "follow", lambda self, *args, first=(): follow(self, *args[:9]))
-    independent, same = variance()
-    freedom = [7 * np.sum(v) ** 2 / np.sum(v**2) for v in (independent, spread)]  # Satterthwaite's
-    assert stats.f.sf(independent.mean() / spread.mean(), *freedom) < 1e-4
-    assert abs(mean.mean() - same.mean()) < 4 * np.hypot(mean.std(ddof=1), same.std(ddof=1)) / 8**0.5
-
-
 # ---- Leaves that walls cross -----------------------------------------------------------------------
 
 
@@ -384,28 +312,3 @@ def test_looking_up_light_beside_walls_loses_none():
     want = want * np.array(exposure.open_share(e, crossed))
     area = np.array(dr.gather(mi.Float, e.area, crossed))
     assert (found * area).sum() == pytest.approx((want * area).sum(), rel=0.03)
-
-
-# ---- Gallery ---------------------------------------------------------------------------------------
-
-
-def test_gallery(tmp_path, capsys):
-    """A page with a strip of three pictures and the figures of each scene; references are kept."""
-    pytest.importorskip("matplotlib")
-    arguments = ["gallery", BOX, "-o", str(tmp_path), "--work", str(tmp_path / "work")]
-    assert main([*arguments, "--seconds", "0.5", "--reference-spp", "16"]) == 0
-    page = (tmp_path / "gallery.md").read_text(encoding="utf-8")
-    assert "cornell_box.xml" in page and "RMSE_a" in page and page.strip() in capsys.readouterr().out
-    strip = np.array(mi.Bitmap(str(tmp_path / "gallery" / "cornell_box.jpg")))
-    assert strip.shape[1] == 3 * strip.shape[0] and list((tmp_path / "work" / "references").glob("*.exr"))
-    assert main(["gallery", "missing.xml", "-o", str(tmp_path)]) == 2
-    assert "missing.xml" in capsys.readouterr().err
-
-
-def test_scenes_of_one_name_are_told_apart():
-    def titles(*paths):
-        return gallery._titles([SimpleNamespace(path=path) for path in paths])
-
-    assert titles("hall/scene.xml", "attic/lamp.xml") == ["scene.xml", "lamp.xml"]
-    assert titles("hall/scene.xml", "attic/scene.xml") == ["hall/scene.xml", "attic/scene.xml"]
-    assert titles("a/hall/scene.xml", "b/hall/scene.xml") == ["a/hall/scene.xml", "b/hall/scene.xml"]

@@ -180,6 +180,12 @@ def row_keys(columns: np.ndarray) -> np.ndarray:
     return (mixed >> np.uint64(1)).astype(np.int64)
 
 
+def runs(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The run that every entry of runs of these lengths is in, and its place there (two int [sum])."""
+    run = np.repeat(np.arange(len(lengths)), lengths)
+    return run, np.arange(len(run)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+
+
 def components(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Labels of ``count`` things, the same for those that links a[k], b[k] connect (int [count])."""
     a, b, label = owned(mi.UInt32, a), owned(mi.UInt32, b), dr.arange(mi.UInt32, count)

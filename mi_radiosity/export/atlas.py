@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import owned
+from ..core.arrays import owned, runs
 from ..core.errors import RadiosityError
 from ..core.extras import optional
 from ..scene import Model
@@ -173,9 +173,8 @@ def _touching(atlas):
     count = extent.prod(axis=1)
     found = []
     for part in np.split(np.arange(len(piece)), np.flatnonzero(np.diff(np.cumsum(count) // CHUNK)) + 1):
-        each = count[part]
-        which = np.repeat(part, each)
-        k = np.arange(len(which)) - np.repeat(np.cumsum(each) - each, each)
+        which, k = runs(count[part])
+        which = part[which]
         x, y = low[which, 0] + k % extent[which, 0], low[which, 1] + k // extent[which, 0]
         centre = np.column_stack([x, y]) + 0.5
         triangle = atlas.place[piece[which]]

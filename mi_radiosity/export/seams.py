@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arrays import runs
 from ..core.extras import optional
 from ..scene import Model
 from .atlas import TUCK, Atlas, on_surface
@@ -47,8 +48,8 @@ def seam_samples(model: Model, atlas: Atlas) -> tuple[tuple[np.ndarray, np.ndarr
     first, second, flipped = _pairs(model, atlas)
     length = np.linalg.norm(_end(atlas, first, 1) - _end(atlas, first, 0), axis=1)
     each = np.ceil(PER_TEXEL * length).astype(int) + 1
-    which = np.repeat(np.arange(len(first[0])), each)
-    t = (np.arange(len(which)) - np.repeat(np.cumsum(each) - each, each)) / np.maximum(each[which] - 1, 1)
+    which, k = runs(each)
+    t = k / np.maximum(each[which] - 1, 1)
     weights = [_along(side, which, s) for side, s in ((first, t), (second, np.where(flipped[which], 1 - t, t)))]
     ends = [on_surface(model, atlas, side[0][which], w)[:2] for side, w in zip((first, second), weights)]
     # Over the edge between two facets, but through anything that stands on it.

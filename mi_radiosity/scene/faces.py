@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import owned, row_keys
+from ..core.arrays import owned, row_keys, runs
 from ..core.errors import RadiosityError
 from .tessellate import tracing_scene
 
@@ -50,7 +50,7 @@ class Faces:
         return len(self.shape)
 
     def _read(self, corners, counts):
-        self.shape = np.repeat(np.arange(len(counts)), counts)
+        self.shape, number = runs(counts)
         if not len(corners):
             raise RadiosityError("the scene has no faces: nothing can be lit")
         self.refuse(~np.isfinite(corners).all(axis=(1, 2)), "has vertices that are not finite numbers: repair the mesh")
@@ -73,7 +73,7 @@ class Faces:
         self.normal = cross / np.where(self.degenerate, 1, double_area)[:, None]
         first = np.cumsum(counts) - counts
         self.first_face = owned(mi.UInt32, first)
-        self._number = owned(mi.UInt32, np.arange(len(corners)) - np.repeat(first, counts))
+        self._number = owned(mi.UInt32, number)
         self._shape = owned(mi.UInt32, self.shape)
 
     def _orient(self):

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import owned, owned_vectors
+from ..core.arrays import owned, owned_vectors, runs
 from ..core.points import coordinates
 
 EDGE = 1e-5  # how far outside of a face, in barycentric coordinates, a point still counts as on it
@@ -96,7 +96,5 @@ def _in_cells(low, high, finest):
     """The cells of grids that boxes reach into: cell y · finest + x, and the number of its box (two int [m])."""
     a, b = (np.clip(np.floor(c * finest[:, None]).astype(np.int64), 0, finest[:, None] - 1) for c in (low, high))
     width, height = (b - a + 1).T
-    count = width * height
-    box = np.repeat(np.arange(len(count)), count)
-    k = np.arange(len(box)) - np.repeat(np.cumsum(count) - count, count)
+    box, k = runs(width * height)
     return (a[box, 1] + k // width[box]) * finest[box] + a[box, 0] + k % width[box], box

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import components, opaque_index, owned
+from ..core.arrays import components, opaque_index, owned, runs
 from .faces import Faces
 from .lookup import EDGE, Lookup, barycentric
 
@@ -216,10 +216,7 @@ class _Grid:
         self._shift = opaque_index(32 - bits)
         low, high = (np.array(x, dtype=np.int64) for x in self._cells(dr.arange(mi.UInt32, len(own)), self._first))
         width = high - low + 1
-        count = width.prod(axis=0)
-        end = np.cumsum(count)
-        face = np.repeat(np.arange(len(own)), count)
-        part = np.arange(end[-1]) - np.repeat(end - count, count)
+        face, part = runs(width.prod(axis=0))
         x, y = part % width[0, face], part // width[0, face]
         cell = [owned(mi.UInt32, low[k, face] + c) for k, c in enumerate((x, y % width[1, face], y // width[1, face]))]
         keys = np.array(self._key(cell, owned(mi.UInt32, own[face])), dtype=np.int64)

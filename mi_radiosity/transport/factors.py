@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import opaque_index, owned
+from ..core.arrays import opaque_index, owned, runs
 from ..core.balance import balance, like
 from ..core.errors import RadiosityError, interruptible
 from ..core.extras import optional
@@ -196,8 +196,7 @@ class _Exchange:
         β = cov(k V, k) / var(k). So in full view all variance is gone, and of other pairs that of k near edges that
         touch, where it is infinite. What n lines all agree on may still be wrong for one in n + 2.
         """
-        pair = np.repeat(np.arange(len(i)), blocks)
-        number = np.arange(len(pair)) - np.repeat(np.cumsum(blocks) - blocks, blocks)
+        pair, number = runs(blocks)
         unit = self.facets.area[i] * self.facets.area[j] / np.where(whole > 0, whole, np.inf)
         sums, most = np.zeros((4, len(pair))), AT_ONCE // LINES
         for start in range(0, len(pair), most):
