@@ -69,6 +69,10 @@ def test_every_line_counts():
             cast.append(dr.width(origin))
             return self._rays.follow(origin, *rest, **more)
 
+        def meet(self, origin, *rest):
+            cast.append(dr.width(origin))
+            return self._rays.meet(origin, *rest)
+
         def blocked(self, a, *rest):
             cast.append(dr.width(a))
             return self._rays.blocked(a, *rest)

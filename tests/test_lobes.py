@@ -35,9 +35,6 @@ MATERIALS = {
     "two sides": {"type": "twosided", "a": DIFFUSE, "b": {"type": "conductor"}},
 }
 TRANSPARENT = ("glass", "thin glass", "rough glass", "null", "mask", "thin principled", "two sides")
-# What the block itself may differ by: a diffuse lobe under a coat is taken as Lambertian, while light that grazes the
-# coat, as the lamp's does here, hardly enters it.
-ASIDE = {"plastic": 0.16, "rough plastic": 0.11}
 
 
 def box(material):
@@ -53,9 +50,7 @@ def box(material):
 @pytest.mark.parametrize("material", MATERIALS)
 def test_pictures_agree_with_path(material):
     """The picture and every wall in it, in every channel, to 1 %; energy kept to 1 %."""
-    solutions, _, _ = compare(
-        box(material), aside={"large-box": ASIDE.get(material, 0.01)}, elements=2000, rays=300_000
-    )
+    solutions, _, _ = compare(box(material), elements=2000, rays=300_000)
     assert np.mean([balance(solution) for solution in solutions]) == pytest.approx(1, abs=0.01)
 
 
@@ -106,9 +101,9 @@ def test_outlines_are_not_looked_for_in_mirrors():
 
 
 @pytest.mark.parametrize(
-    "material, albedo", [("plastic", 0.455), ("rough plastic", 0.441), ("principled", 0.388), ("blend", 0.25)]
+    "material, albedo", [("plastic", 0.455), ("rough plastic", 0.441), ("principled", 0.388), ("blend", 0.268)]
 )
-def test_rho_is_the_albedo_of_the_diffuse_lobe(material, albedo):
+def test_rho_is_the_albedo_of_sampled_diffuse_lobes(material, albedo):
     """At a reflectance of one half, as found by independent sampling to 1 %."""
     grey = {"type": "rgb", "value": 0.5}
     bsdf = {

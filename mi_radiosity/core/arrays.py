@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -125,6 +127,22 @@ class ColorSums:
         return [t * u for t, u in zip(totals(self._sums), self.unit)]
 
 
+def replaced(tree: Any, rows: "mi.UInt32", others: Any) -> Any:
+    """A dataclass of arrays [n] whose entries ``rows`` (UInt32 [m], no two the same) are those of ``others`` [m]."""
+    names = [f.name for f in fields(tree)]
+    row = dr.full(mi.UInt32, NONE, max(dr.width(getattr(tree, name)) for name in names))
+    dr.scatter(row, dr.arange(mi.UInt32, dr.width(rows)), rows)
+    dr.eval(row, others)
+    there = row != NONE
+    gathered = (dr.gather(type(x), x, row, there) for x in (getattr(others, name) for name in names))
+    return select(there, type(tree)(*gathered), tree)
+
+
+def select(active: "mi.Bool", one: Any, other: Any) -> Any:
+    """`dr.select` for dataclasses of arrays, column by column."""
+    return type(one)(*(dr.select(active, getattr(one, f.name), getattr(other, f.name)) for f in fields(one)))
+
+
 def totals(arrays: "Sequence[dr.ArrayBase]") -> list[float]:
     """Sums of several arrays, as Python floats, read in one go."""
     sums = [dr.sum(a) for a in arrays]
@@ -165,6 +183,10 @@ class Distribution:
         """Where the weight of a number begins (Float64 [m])."""
         end, weight = dr.gather(mi.UInt64, self.cumulative, number), dr.gather(mi.UInt64, self.weight, number)
         return mi.Float64(end - weight)
+
+    def shares(self) -> "mi.Float64":
+        """Cumulative probabilities Σ_(k ≤ i) p(k) (Float64 [n])."""
+        return mi.Float64(self.cumulative) / dr.opaque(mi.Float64, self.whole)
 
     def probability(self, number: "mi.UInt32") -> "mi.Float64":
         """p(number) (Float64 [m])."""

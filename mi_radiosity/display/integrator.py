@@ -1,18 +1,19 @@
 """The `radiosity` integrator: any sensor looks at a solution through Mitsuba's own film."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..core.arrays import NONE
+from ..core.arrays import NONE, select
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
-from ..scene.hit import Trail
 from ..solver import solve
+from ..transport import PathEnd
 from .denoise import CleanPicture
 from .pixels import FilmPicture, grow
 from .shaders import SHADERS, Look
@@ -122,42 +123,41 @@ def _integrator_class():
 
         def _sample(self, sampler, ray, active=True, met=None):
             """What `sample` gives of a scene that is prepared; ``met``: what rays meet first, if that is known."""
-            solution = self.solution
-            model, rays = solution.model, solution.model.rays
+            solution, shader = self.solution, self._shader
+            model, rays, plain = solution.model, solution.model.rays, solution.model.materials.all_plain
             if met is None:
                 met = self._see(ray, active)
-            if rays.lobes is None:
-                hit = rays.locate(met, ray.d)
-            else:
+            hit = rays.locate(met, ray.d)
+            on_patch = active & hit.valid & (hit.patch != NONE)
+            emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, on_patch)
+
+            # Follow rays past surfaces that are not plainly diffuse.
+            number = seed = mi.UInt32(0)
+            first: tuple = ()
+            if not plain:
                 number, seed = (mi.UInt32(sampler.next_1d() * 2.0**32) for _ in range(2))
-                lamps = solution.gatherer.highlights
-                # The first lobe, and a line to a lamp from there, are as well spread as the ray is.
-                first = sampler.next_1d(), *sampler.next_2d(), *sampler.next_2d(), sampler.next_1d()
-                hit = rays.follow(ray.o, ray.d, number, seed, camera=True, highlights=lamps, first=first, met=met)
-                if self._shader.colors:  # no coat lies over them, but where rays go on straight they do
-                    nearest, on = rays.locate(met, ray.d), hit.straight_on(ray.d)
-                    hit = Trail.straight(nearest, ray.d).where((nearest.patch != NONE) & ~on, hit)
-            valid = hit.valid & active
-            lit = valid & (hit.patch != NONE)
-            leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, lit)
-            reflectance = model.reflectance_at(hit.patch, hit.u, hit.v, lit)
-            emits = lit if rays.lobes is None else lit & ~hit.coated  # then it is in the glow
-            emission = model.lights.at(model.patches, hit.patch, hit.u, hit.v, emits)
-            if rays.lobes is not None:
-                emission *= hit.share
-            look = Look(ray, hit, leaf, emission, reflectance, lit, sampler)
-            radiance = dr.select(lit, self._shader.radiance(look), 0)
-            if model.lights.sky_light and (rays.lobes is not None or not self.hide_emitters):
-                direction = ray.d if rays.lobes is None else hit.direction
-                seen = 1 if rays.lobes is None else hit.share
-                if self.hide_emitters:  # only where it is seen directly
-                    seen = dr.select(hit.bounced, seen, 0)
-                radiance += model.lights.sky(direction, active & ~hit.valid) * seen * dr.inv_pi
-                valid |= active & (mi.Bool(not self.hide_emitters))
-            if rays.lobes is not None:
-                if not self._shader.colors:
-                    radiance = dr.select(active, hit.weight * radiance + hit.glow * dr.inv_pi, 0)
-                valid |= active & hit.bounced
+                # The first vertex is as well spread as the ray is.
+                shadow, direction = (sampler.next_1d(), *sampler.next_2d()), (sampler.next_1d(), *sampler.next_2d())
+                first = (*shadow, *direction)
+            follows = active & hit.valid
+            end = shader.paths.follow(met, hit, ray, number, seed, follows, shader.reads, False, first)
+            if shader.colors and not plain:  # no coat lies over them, but where rays go on straight they do
+                leaf = solution.elements.leaf_at(hit.patch, hit.u, hit.v, on_patch)
+                end = select(on_patch & ~end.straight, PathEnd.at(leaf, hit), end)
+
+            # What is there, and what was found on the way.
+            lit = follows & (end.leaf != NONE)
+            reflectance = model.reflectance_at(end.patch, end.u, end.v, lit)
+            glows = dr.select(hit.traced, emission, 0)
+            shown = replace(hit, patch=end.patch, u=end.u, v=end.v)
+            look = Look(ray, shown, end.leaf, emission - glows, reflectance, lit, sampler, end.straight)
+            radiance = dr.select(lit, shader.at_end(look, end, number, seed), 0)
+            valid = follows & (~hit.traced | lit | end.passed)
+            if not shader.colors:
+                radiance += dr.select(follows, (end.light + glows) * dr.inv_pi, 0)
+            if model.lights.sky_light and not self.hide_emitters:
+                radiance += model.lights.sky(ray.d, active & ~hit.valid) * dr.inv_pi
+                valid |= active
             return radiance, valid, []
 
         def traverse(self, callback):

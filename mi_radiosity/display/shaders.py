@@ -1,15 +1,17 @@
 """Shadings: how a solution looks where a camera ray meets it. One class each, known by its name."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.arrays import NONE
 from ..core.plugins import Registry
 from ..core.points import coordinates, cosine_direction
 from ..scene.hit import Hit
 from ..solver import Field, Solution
-from ..transport import Places
+from ..transport import PathEnd, Paths, Places
 
 LINE_WIDTH = 1.0  # pixels
 LINE_SHADE = 0.25  # of the picture under an element outline
@@ -27,6 +29,7 @@ class Look:
     reflectance: "mi.Color3f"  # ρ at the hit, textures and all
     lit: "mi.Bool"  # the ray meets a patch; the others are black
     sampler: "mi.Sampler"
+    straight: "mi.Bool"  # nothing but null lobes came before
 
 
 class Shader:
@@ -34,6 +37,7 @@ class Shader:
     `Solution.render` know it from then on, and defines `irradiance`, or `radiance` itself."""
 
     name = ""
+    reads = True  # are pictures made of what a solution has at the first vertex of a camera path, too?
     samples = False  # is more light gathered for every camera sample, so that pictures get better with time?
     colors = False  # is what it shows no light, so that neither coats nor lamps mirrored in them belong to it?
 
@@ -57,6 +61,27 @@ class Shader:
     def radiance(self, look: Look) -> "mi.Color3f":
         """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays])."""
         return (look.emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
+
+    @cached_property
+    def paths(self) -> Paths:
+        """What follows camera rays past surfaces that are not plainly diffuse, to where `radiance` is asked for."""
+        model = self.solution.model
+        return Paths(
+            model, self.solution.elements, partial(_at_points, model), partial(_sun_is_left_out, self.solution)
+        )
+
+    def at_end(self, look: Look, end: PathEnd, number: "mi.UInt32", seed: "mi.UInt32") -> "mi.Color3f":
+        """What camera paths bring from where they end (Color3f [rays]). number, seed: see `Paths.follow`."""
+        return self.radiance(look) if self.colors else end.weight * self.radiance(look)
+
+
+def _at_points(model, leaf, patch, u, v, active):
+    """ρ at points of patches, textures and all (Color3f [n])."""
+    return model.reflectance_at(patch, u, v, active)
+
+
+def _sun_is_left_out(solution, direction):
+    return solution.gatherer.is_sharp_sky(direction)
 
 
 class Gouraud(Shader):
@@ -110,9 +135,7 @@ class Mesh(Gouraud):
         here = local(ray.o, ray.d)
         dx, dy = local(ray.o_x, ray.d_x) - here, local(ray.o_y, ray.d_y) - here
         per_pixel = dr.sqrt(dx * dx + dy * dy)
-        lobes = self.solution.model.rays.lobes is not None
-        seen = look.lit & look.hit.straight_on(ray.d) if lobes else look.lit  # not in a mirror
-        return seen & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
+        return look.lit & look.straight & dr.any(here < 0.5 * LINE_WIDTH * per_pixel)
 
 
 class Gather(Shader):
@@ -120,6 +143,7 @@ class Gather(Shader):
     importance. As sharp as path tracing, whose paths it ends at their second diffuse lobe."""
 
     name = "gather"
+    reads = False
     samples = True
 
     def __init__(self, solution: Solution) -> None:
@@ -129,6 +153,17 @@ class Gather(Shader):
         caustic = solution.caustic
         some = caustic is not None and dr.any(caustic > 0, axis=None)
         self._caustic = Field(solution, caustic) if some else None
+        self.paths = self._gatherer.paths_with(caustic if some else None)
+
+    def at_end(self, look: Look, end: PathEnd, number: "mi.UInt32", seed: "mi.UInt32") -> "mi.Color3f":
+        traced, camera = look.hit.traced, mi.Point3f(look.ray.o - self.solution.model.patches.origin)
+        look = replace(look, lit=look.lit & ~traced)
+        lit = dr.select(look.lit, self.radiance(look), 0)
+        if self.solution.model.materials.all_plain:
+            return lit
+        end = replace(end, leaf=dr.select(traced, end.leaf, NONE))
+        light = self._gatherer.reflected_by(end) + end.weight * self._gatherer.by_sharp_light(camera, end, number, seed)
+        return lit + light * dr.inv_pi
 
     def irradiance(self, look: Look) -> "mi.Color3f":
         lamps, room = self._samples(look)
@@ -163,9 +198,11 @@ class Direct(Gather):
     """Light of the lamps gathered at every pixel, the rest from the continuous field."""
 
     name = "direct"
+    reads = True
 
     def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
+        self.paths = Shader.paths.func(self)
         self._field = Field(solution, solution.indirect)
 
     def irradiance(self, look: Look) -> "mi.Color3f":

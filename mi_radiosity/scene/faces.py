@@ -19,6 +19,7 @@ SPREAD = (  # of bits to every third: shifts, and the bits that are right after 
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
+BENT = 0.866  # cosine between shading and geometric normal, below which a face counts as bent
 FLATNESS = 1e-12  # area / longest edge² below which a face is degenerate
 
 
@@ -31,7 +32,8 @@ class Faces:
     corners), ``rank`` (its place in an order that only geometry decides) and ``order`` (the faces in it); ``vertex``
     [faces, 3]: numbers of their corners, the same where positions are the same to the bit. ``low``, ``high``,
     ``centre`` [3] of the box around them; ``lift``: by how much rays must start off a surface, and what lies in one
-    plane, m; ``smooth``: some shapes have vertex normals.
+    plane, m; ``smooth``: some shapes have vertex normals; ``bent`` [faces]: those whose vertex
+    normals are far from the geometric one.
 
     Raises RadiosityError for what cannot be read, naming the shape.
     """
@@ -45,6 +47,7 @@ class Faces:
         self.smooth = any(mesh.has_vertex_normals() for mesh in self.tracing.shapes())
         self._read(*_corners(self.tracing))
         self._orient()
+        self.bent = self._bent()
 
     def __len__(self) -> int:
         return len(self.shape)
@@ -84,6 +87,17 @@ class Faces:
         shading = np.array(si.sh_frame.n, dtype=np.float64).reshape(3, n).T
         self.flipped = (shading * self.normal).sum(axis=1) < 0
         self.normal[self.flipped] *= -1
+
+    def _bent(self):
+        """Which faces have vertex normals far from the geometric normal (bool [faces])."""
+        cosine, start = np.ones(len(self)), 0
+        for mesh in self.tracing.shapes():
+            faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
+            part, start = slice(start, start + len(faces)), start + len(faces)
+            if mesh.has_vertex_normals() and not mesh.has_face_normals():
+                normals = np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)[faces]
+                cosine[part] = np.abs(np.einsum("ijk,ik->ij", normals, self.normal[part])).min(axis=1)
+        return ~self.degenerate & (cosine < BENT)
 
     @cached_property
     def vertex(self) -> np.ndarray:

@@ -1,7 +1,6 @@
-"""Lobes that are not diffuse are traced: a ray goes on through mirrors, glass, gloss and masks until a diffuse lobe."""
+"""Power rays past surfaces that are not plainly diffuse: through mirrors, glass, gloss and masks to a diffuse lobe."""
 
 import gc
-from collections.abc import Sequence
 from contextlib import contextmanager
 from typing import Any
 from weakref import ref
@@ -11,16 +10,20 @@ import mitsuba as mi
 
 from ..core.arrays import NONE
 from ..core.points import ROUNDS
-from .gloss import Gloss
-from .hit import Hit, Trail
+from .hit import Hit
 
 ROULETTE = 5  # lobes after which a ray may end by chance
-MOST = 64  # lobes after which it ends
+MAX_DEPTH = 64  # lobes after which it ends
 ANY = 1 << 30  # recordings for a scene: one for every pattern of widths
 
 
 class Lobes:
-    """Follows rays in a scene some of whose shapes have lobes that are not diffuse."""
+    """Follows power rays in a scene some of whose shapes are not plainly diffuse.
+
+    At every such surface one lobe is sampled by Mitsuba's `bsdf.sample`, for the transport of importance. A diffuse lobe
+    ends the ray. Its weight over the mean reflectance ρ of the patch multiplies the power that arrives, so that the mean
+    of what the patch receives is what arrives there. Any other lobe sends the ray on.
+    """
 
     def __init__(self) -> None:
         # A solve follows many short waves of rays: they are traced in less time than the loop is told to Dr.Jit in.
@@ -40,95 +43,66 @@ class Lobes:
         ray: "mi.Ray3f",
         number: "mi.UInt32",
         seed: "mi.UInt32",
-        mode: "mi.TransportMode",
-        camera: bool,
-        highlights: Any = None,
-        first: "Sequence[mi.Float]" = (),
-    ) -> Trail:
-        """Follow rays of a ``number`` each (UInt32 [n]), which have ``met`` a lobe, to the first diffuse one that they
-        draw; returns a Trail.
+    ) -> Hit:
+        """Where rays end whose first hits are not plainly diffuse.
 
-        hit: the name of what they have met. mode: mi.TransportMode.Importance for rays that carry power, Radiance for
-        those that look for light. camera: the first surface's own light counts, too. highlights: how rough lobes see
-        lamps; without, only by their own rays. first: uniform numbers that the first lobe is drawn with, three, and
-        then its lines (Float [n]); those of well spread rays are well spread, too.
+        met, hit: those first hits; number (UInt32 [n]), seed: what random numbers are made from.
         """
         n = dr.width(ray.d)
         random = mi.PCG32(initstate=mi.sample_tea_64(number, seed, ROUNDS), initseq=mi.UInt64(number))
-        state = (dr.full(mi.Bool, True, n), met, ray, dr.zeros(mi.UInt32, n), random, Trail.straight(hit, ray.d))
-        if highlights is None and not first:
-            with _garbage_kept():
-                return self._frozen(ref(rays), state, mode, camera)[-1]
-        # Most rays are done after one lobe: the others go on side by side, and do not keep these waiting.
-        alive, *state = self._past(rays, state, mode, camera, highlights, first, only_one=True)
-        dr.eval(alive, state)
-        trail, on = state[-1], dr.compress(alive)
-        if dr.width(on):
-            state = dr.full(mi.Bool, True, dr.width(on)), *(dr.gather(type(x), x, on) for x in state)
-            dr.scatter(trail, self._past(rays, state, mode, False, highlights)[-1], on)
-        return trail
+        no, black = dr.zeros(mi.Bool, n), dr.zeros(mi.Color3f, n)
+        end = Hit(hit.valid, hit.patch, hit.u, hit.v, hit.back, hit.traced, no, no, black + 1, black)
+        state = (dr.full(mi.Bool, True, n), met, ray, dr.zeros(mi.UInt32, n), random, end)
+        with _garbage_kept():
+            return self._frozen(ref(rays), state)[-1]
 
-    def _past(self, rays, state, mode, camera, highlights=None, first=(), only_one=False):
-        """The state of rays past all lobes, or past one."""
-        ctx, gloss = mi.BSDFContext(mode), Gloss(mode)
+    def _past(self, rays, state):
+        """The state of rays past all lobes."""
+        ctx = mi.BSDFContext(mi.TransportMode.Importance)
 
-        def step(alive, met, ray, depth, random, trail):
-            chance = _Chance(random, depth == 0, first)
-            return self._step(rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail)
+        def step(alive, met, ray, depth, random, end):
+            return self._step(rays, ctx, alive, met, ray, depth, random, end)
 
-        return step(*state) if only_one else dr.while_loop(state, lambda alive, *_: alive, step)
+        return dr.while_loop(state, lambda alive, *_: alive, step)
 
-    def _step(self, rays, ctx, gloss, camera, highlights, alive, met, ray, depth, chance, trail):
-        """Past one more surface that has other lobes than a diffuse one."""
-        before, on_patch = trail.weight, trail.patch != NONE
+    def _step(self, rays, ctx, alive, met, ray, depth, random, end):
+        """Past one more surface."""
+        # Sample one lobe.
+        before, on_patch = end.weight, end.patch != NONE
         si = met.compute_surface_interaction(ray, mi.RayFlags.All, alive)
-        s, st = chance.next_float32(), mi.Point2f(chance.next_float32(), chance.next_float32())
-        bsdf = si.bsdf(ray)
-        sample, value = bsdf.sample(ctx, si, s, st, alive)
-        parts = mi.Float(0), mi.Float(0)
-        if rays.glossy:
-            parts = gloss.shares(bsdf, si, alive)
-            value = gloss.weigh(bsdf, si, sample, value, parts)
-        value = dr.select(alive & dr.isfinite(value), value, 0)
-        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-        coated = alive & drawn & on_patch & (dr.max(value) > 0)
-        on = alive & ~coated
-        rough = on & (parts[0] > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
+        s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
+        sample, value = si.bsdf(ray).sample(ctx, si, s, st, alive)
+        value = dr.select(alive & dr.all(dr.isfinite(value)), value, 0)
 
-        shines = alive & on_patch & (trail.bounced | camera)
-        glow = before * dr.gather(mi.Color3f, rays.patches.emission, trail.patch, shines) * trail.share
-        if highlights is not None:
-            glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, alive & (parts[0] > 0))
-        rho = dr.gather(mi.Color3f, rays.patches.reflectance, trail.patch, coated)
-        factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
-        # Sides with a diffuse lobe count all that meets them as received, the others nothing.
+        # A diffuse lobe of a patch ends the ray.
+        diffuse = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        ends = alive & diffuse & on_patch & (dr.max(value) > 0)
+        on = alive & ~ends
+        rho = dr.gather(mi.Color3f, rays.patches.reflectance, end.patch, ends)
+        factor = dr.select(ends, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
+        # Sides with a diffuse lobe count all that arrives as received, the others nothing.
         taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
 
+        # Any other lobe sends it on, as far as Russian roulette allows.
         depth += 1
         lives = dr.select(on & (depth > ROULETTE), dr.minimum(dr.max(before * factor), 0.95), 1)
-        goes_on = on & (dr.max(before * factor) > 0) & (chance.random.next_float32() < lives) & (depth < MOST)
+        goes_on = on & (dr.max(before * factor) > 0) & (random.next_float32() < lives) & (depth < MAX_DEPTH)
         ray = dr.select(goes_on, si.spawn_ray(si.to_world(sample.wo)), ray)
         met = rays.scene.ray_intersect_preliminary(ray, active=goes_on)
-        hit, share = rays.locate(met, ray.d), mi.Float(1)
-        if highlights is not None:  # lines look for lamps as well
-            pdf = gloss.light(bsdf, si, sample.wo, parts[0], rough)[1]
-            share = dr.select(pdf > 0, pdf / (pdf + highlights.density(ray.o, ray.d, hit)), 1)
-        trail = Trail(
+        hit = rays.locate(met, ray.d)
+        end = Hit(
             valid=hit.valid | ~goes_on,
-            patch=dr.select(goes_on, hit.patch, dr.select(on, NONE, trail.patch)),
-            u=dr.select(goes_on, hit.u, trail.u),
-            v=dr.select(goes_on, hit.v, trail.v),
-            direction=ray.d,
+            patch=dr.select(goes_on, hit.patch, dr.select(on, NONE, end.patch)),
+            u=dr.select(goes_on, hit.u, end.u),
+            v=dr.select(goes_on, hit.v, end.v),
+            back=end.back,
+            traced=end.traced,
+            bounced=end.bounced | on,
+            rough=dr.select(end.bounced, end.rough, on & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)),
             weight=dr.select(on & ~goes_on, 0, before * factor / dr.maximum(lives, 1e-6)),
-            bounced=trail.bounced | on,
-            traced=trail.traced | alive,
-            coated=coated,
-            taken=trail.taken + taken,
-            glow=trail.glow + glow,
-            share=dr.select(goes_on, share, trail.share),
-            rough=dr.select(trail.bounced, trail.rough, rough),
+            taken=end.taken + taken,
         )
-        return goes_on & hit.traced, met, ray, depth, chance.random, trail
+        return goes_on & hit.traced, met, ray, depth, random, end
 
 
 @contextmanager
@@ -141,14 +115,3 @@ def _garbage_kept():
     finally:
         if collects:
             gc.enable()
-
-
-class _Chance:
-    """Uniform numbers: of a generator, but for the first few of those who have some ``given``."""
-
-    def __init__(self, random: "mi.PCG32", has: "mi.Bool", given: "Sequence[mi.Float]") -> None:
-        self.random, self._has, self._given = random, has, list(given)
-
-    def next_float32(self) -> "mi.Float":
-        number = self.random.next_float32()
-        return dr.select(self._has, self._given.pop(0), number) if self._given else number

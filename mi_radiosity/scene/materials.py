@@ -11,7 +11,6 @@ from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
 from ..core.points import Stream, kronecker, stream_seed, triangle
 from .faces import Faces
-from .gloss import Gloss, is_glossy
 from .lights import LIGHTS
 from .tessellate import UNMESHED, Part, children, parts
 
@@ -19,6 +18,8 @@ DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
+FRAMES = {"NormalMap", "BumpMap"}
+BENT = 2
 WHITEST, ROUNDING = 0.999, 1e-4
 POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES = 1 << 15  # for the albedo of a shape
@@ -29,8 +30,8 @@ AT_ONCE = 1 << 22  # samples in one launch
 
 class Materials:
     """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
-    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]; ``glossy``: are
-    there rough lobes? ``bsdfs`` [shapes]: Mitsuba's.
+    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]. ``bsdfs``
+    [shapes]: Mitsuba's. ``bent`` [faces]: shading normals, of vertices or of a map, are far from the geometric one.
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -44,8 +45,11 @@ class Materials:
         self.traced = np.array([not is_diffuse(s.bsdf()) for s in shapes])
         self._alike = np.array([has_like_sides(s.bsdf()) for s in shapes])
         self.bsdfs = mi.BSDFPtr([s.bsdf() for s in shapes])
-        self.glossy = bool(dr.any(is_glossy(self.bsdfs))[0])
-        self.traced_faces = owned(mi.UInt32, self.traced[faces.shape])
+        bent_frames = np.array([has_bent_frames(s.bsdf()) for s in shapes])
+        self.bent = faces.bent | bent_frames[faces.shape]
+        # 0: plainly diffuse; 1: other lobes as well; 2: shading normals that the cache of radiosity does not have.
+        self._kind = owned(mi.UInt32, np.where(self.bent, BENT, self.traced[faces.shape]))
+        self.all_plain = not (self.traced.any() or self.bent.any())
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))
         plain = ~self.traced[faces.shape]
@@ -66,6 +70,8 @@ class Materials:
             where = faces.names(np.asarray(white.any(axis=(0, 2))))
             faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
             self.rho = np.minimum(self.rho, WHITEST)
+        # Are there surfaces with a diffuse lobe and others?
+        self.mixed = bool((self.bent | (self.traced[faces.shape] & self.rho.any(axis=(0, 2)))).any())
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
     def _mean(self, faces, points):
@@ -89,10 +95,20 @@ class Materials:
         return np.array([np.array(total, dtype=np.float64).reshape(3, n).T / points for total in totals])
 
     def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
-        """Do faces have lobes that are traced (Bool [n])?"""
-        if not self.traced.any():
+        """Are faces not plainly diffuse, so that paths evaluate their BSDF (Bool [n])?"""
+        if self.all_plain:
             return mi.Bool(False)
-        return dr.gather(mi.UInt32, self.traced_faces, face, active) != 0
+        return dr.gather(mi.UInt32, self._kind, face, active) != 0
+
+    def is_bent(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Are the shading normals of faces far from the geometric one (Bool [n])?"""
+        if self.all_plain:
+            return mi.Bool(False)
+        return dr.gather(mi.UInt32, self._kind, face, active) == BENT
+
+    def arrays(self) -> list:
+        """What `is_traced` and `is_bent` read, and Mitsuba's BSDFs."""
+        return [self._kind, self.bsdfs]
 
     def _find_albedos(self, textured):
         """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""
@@ -129,12 +145,9 @@ class Materials:
         x, y, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
         a, b, c, _ = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO, 1)), k // each)
         si = self._faces.surface(face, *triangle(x, y))
-        wi, gloss = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t)), Gloss(mi.TransportMode.Radiance)
+        wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
         si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
-        bsdf = si.bsdf()
-        sample, value = bsdf.sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
-        if self.glossy:
-            value = gloss.weigh(bsdf, si, sample, value, gloss.shares(bsdf, si, dr.full(mi.Bool, True, len(k))))
+        sample, value = si.bsdf().sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
         drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
         value = dr.select(drawn & dr.isfinite(value), value, 0)
         dr.eval(value)  # in one go: sums one by one would draw all again
@@ -164,6 +177,11 @@ def is_diffuse(bsdf: "mi.BSDF") -> bool:
     if kind in NESTING:
         return all(is_diffuse(part) for part in children(bsdf) if isinstance(part, mi.BSDF))
     return kind in DIFFUSE
+
+
+def has_bent_frames(bsdf: "mi.BSDF") -> bool:
+    """Does ``bsdf`` contain a normal map or a bump map?"""
+    return bsdf.class_name() in FRAMES or any(has_bent_frames(b) for b in children(bsdf) if isinstance(b, mi.BSDF))
 
 
 def has_like_sides(bsdf: "mi.BSDF") -> bool:

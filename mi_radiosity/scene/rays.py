@@ -1,16 +1,15 @@
 """Rays between patches: where they end, what they miss, and the kernel F along them."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, owned, owned_vectors
+from ..core.arrays import NONE, owned, owned_vectors, replaced
 from ..core.points import cosine_direction
 from .faces import Faces
-from .hit import Hit, Trail
+from .hit import Hit
 from .lobes import Lobes
 from .lookup import Lookup
 from .materials import Materials
@@ -23,7 +22,7 @@ class Rays:
     def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
         self.scene, self.patches = faces.tracing, patches
         self._materials = materials
-        self.lobes, self.glossy = Lobes() if materials.traced.any() else None, materials.glossy
+        self.lobes = None if materials.all_plain else Lobes()
         self._first_face = faces.first_face
         self.front = owned_vectors(mi.Vector3f, faces.normal)
         self._patch_of = patch_table(faces, patches)
@@ -34,9 +33,9 @@ class Rays:
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
         p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
-        named = [self._first_face, self.front, self._patch_of, self._materials.traced_faces, p.emission, p.reflectance]
+        named = [self._first_face, self.front, self._patch_of, *self._materials.arrays(), p.emission, p.reflectance]
         # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
-        return [self.scene, self.scene.shapes_dr(), self._materials.bsdfs, *named, *overlaps]
+        return [self.scene, self.scene.shapes_dr(), *named, *overlaps]
 
     def leave(
         self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", s: "mi.Float", t: "mi.Float"
@@ -106,36 +105,26 @@ class Rays:
         direction: "mi.Vector3f",
         number: "mi.UInt32",
         seed: "mi.UInt32",
-        power: bool = False,
-        camera: bool = False,
         active: "mi.Bool | bool" = True,
-        highlights: Any = None,
-        first: "Sequence[mi.Float]" = (),
-        met: "mi.PreliminaryIntersection3f | None" = None,
-    ) -> Hit | Trail:
-        """Where rays end that go on through lobes that are not diffuse: a Trail, or a Hit in scenes without such.
+    ) -> Hit:
+        """Where power rays end: on the patch that they hit first, or, past surfaces that are not plainly diffuse, on the
+        first one whose diffuse lobe is sampled (see `Lobes`).
 
-        number: UInt32 [rays], what their chances are drawn by. power: they carry it, and do not look for light.
-        camera: they look for light, and the first surface's own counts. highlights, first: see `Lobes.follow`. met: the
-        first intersections, if they are known.
+        number: UInt32 [rays], seed: UInt32, what the random numbers are made from.
         """
-        if met is None:
-            met = self.meet(origin, direction, active)
+        met = self.meet(origin, direction, active)
         hit = self.locate(met, direction)
         if self.lobes is None:
             return hit
-        # Those that go on do so side by side, and do not keep the others waiting.
+        # Rays that go on do so side by side, and do not keep the others waiting.
         every = dr.zeros(mi.UInt32, dr.width(direction))
-        states = [met, hit, mi.Point3f(origin + every), direction, number + every, seed + every, *first]
+        states = [met, hit, mi.Point3f(origin + every), direction, number + every, seed + every]
         dr.eval(states)
         on = dr.compress(hit.traced)
-        end = Trail.straight(hit, direction)
         if dr.width(on) == 0:
-            return end
-        met, hit, origin, direction, number, seed, *first = (dr.gather(type(x), x, on) for x in states)
-        mode, ray = mi.TransportMode.Importance if power else mi.TransportMode.Radiance, mi.Ray3f(origin, direction)
-        followed = self.lobes.follow(self, met, hit, ray, number, seed, mode, camera, highlights, first)
-        return end.replaced(on, followed)
+            return hit
+        met, first, origin, direction, number, seed = (dr.gather(type(x), x, on) for x in states)
+        return replaced(hit, on, self.lobes.follow(self, met, first, mi.Ray3f(origin, direction), number, seed))
 
     def on_top(self, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float") -> "mi.Bool":
         """Does nothing lie on these points of patches (Bool [n])? What does is in their plane."""

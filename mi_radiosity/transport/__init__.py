@@ -3,6 +3,7 @@
 from .factors import Closure, ViewFactors, view_factors
 from .gather import Gatherer, Places
 from .gathering import Gathering
+from .paths import PathEnd, Paths
 from .problem import Flow, Problem
 from .series import PILOT, Shooting, Transport
 
@@ -12,6 +13,8 @@ __all__ = [
     "Flow",
     "Gatherer",
     "Gathering",
+    "PathEnd",
+    "Paths",
     "Places",
     "Problem",
     "Shooting",

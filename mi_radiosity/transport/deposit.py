@@ -4,12 +4,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE
-from ..scene.hit import Hit, Trail
+from ..scene.hit import Hit
 from .emit import Batch
 from .problem import Problem
 
 
-def pair_of(problem: Problem, batch: Batch, hit: Hit | Trail) -> "mi.UInt32":
+def pair_of(problem: Problem, batch: Batch, hit: Hit) -> "mi.UInt32":
     """The pair without children that each ray belongs to (UInt32 [rays]).
 
     NONE before its root exists, and for rays that belong to no pair: those of lamps that are no surface, and those
@@ -20,13 +20,13 @@ def pair_of(problem: Problem, batch: Batch, hit: Hit | Trail) -> "mi.UInt32":
     return problem.pairs.descend(pair, hit.patch, hit.u, hit.v, batch.patch, batch.u, batch.v, pair != NONE)
 
 
-def straight(batch: Batch, hit: Hit | Trail) -> "mi.Bool":
+def straight(batch: Batch, hit: Hit) -> "mi.Bool":
     """Did rays go straight from a patch to a patch (Bool [rays])?"""
     on_patch = (hit.patch != NONE) & (batch.patch != NONE)
-    return on_patch & ~hit.bounced if isinstance(hit, Trail) else on_patch
+    return on_patch & ~hit.bounced
 
 
-def spread(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
+def spread(problem: Problem, hit: Hit, pair: "mi.UInt32") -> "mi.UInt32":
     """Over the receiver of the pair, or all of the patch, which shares with its cluster: smooth, for pilots
     (UInt32 [rays])."""
     known, crown = pair != NONE, problem.elements.crown
@@ -36,7 +36,7 @@ def spread(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32"
     return dr.select(known, receiver, hit.patch)
 
 
-def trusted(problem: Problem, hit: Hit | Trail, pair: "mi.UInt32") -> "mi.UInt32":
+def trusted(problem: Problem, hit: Hit, pair: "mi.UInt32") -> "mi.UInt32":
     """Over the receiver of a pair the oracle has seen in full view, else to the leaf the ray meets (UInt32 [rays]).
 
     Spreading it over a receiver that something hides a part of, or that a wall crosses, would let light through.

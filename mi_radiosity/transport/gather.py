@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -10,9 +11,9 @@ from ..core.arrays import NONE, opaque_index
 from ..core.points import Stream, kronecker, stream_seed, triangle, uniform
 from ..mesh import Elements, Exposure
 from ..scene import Model
-from .highlights import Highlights
 from .lamps import LampChoice
 from .landings import Landings
+from .paths import PathEnd, Paths
 
 LOOKS = 32  # points of a crossed leaf
 AFAR = 4.0  # sizes of an element, from which it is looked at as a whole
@@ -20,23 +21,14 @@ AFAR = 4.0  # sizes of an element, from which it is looked at as a whole
 
 @dataclass
 class Found:
-    """What rays into the room have found, [n]: H of lamps that are surfaces, and of the sky; H of lobes that shine, and
-    of sharp light where rays end; and the point (patch, u, v) of a leaf that they end on, whose ρ H times ``weight`` is
-    the light that it adds, if it is in sight there."""
+    """What rays into the room have found, [n]: H of area emitters and of the sky, seen directly; H of light that came
+    past other surfaces, and of delta direct light where paths end; and that end, whose ρ H times ``end.weight`` is the
+    light that it adds, as far as it is in sight there."""
 
     lamps: "mi.Color3f"
     sky: "mi.Color3f"
     glow: "mi.Color3f"
-    leaf: "mi.UInt32"  # NONE for rays that end on none
-    patch: "mi.UInt32"
-    u: "mi.Float"
-    v: "mi.Float"
-    weight: "mi.Color3f"
-
-    @property
-    def end(self) -> "tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]":
-        """Where they end."""
-        return self.leaf, self.patch, self.u, self.v
+    end: PathEnd
 
 
 @dataclass
@@ -80,7 +72,13 @@ class Gatherer:
         self._place(landings)
         self._lamps = LampChoice.of(elements)
         self._free = model.lights.free
-        self.highlights = Highlights(model, self._lamps) if model.rays.glossy else None
+        self.paths = self.paths_with(None)
+
+    def paths_with(self, caustic: "mi.Color3f | None") -> Paths:
+        """Paths that end on elements; those that do not read the cache at a vertex add ``caustic`` there (Color3f
+        [elements])."""
+        model, elements = self._model, self._elements
+        return Paths(model, elements, partial(_of_elements, elements), partial(_is_sun, model, self._looks), caustic)
 
     def seeing(self, reflected: "mi.Color3f", landings: Landings) -> "Gatherer":
         """The same for other values of ρ H, and where that light is."""
@@ -146,9 +144,8 @@ class Gatherer:
         lamp, density = self._lamps.draw(lot, places.leaf)
         u, v = triangle(s, t)
         F = self._model.rays.kernel_at(places.x, places.normal, lamp, u, v, active)
-        by_rays = dr.select(self._is_met_by_rays(lamp), rays_per_line * F, 0)
         lit = self._model.lights.at(self._model.patches, lamp, u, v, F > 0) * F
-        return lit / (density + by_rays), lit / density
+        return lit / (density + rays_per_line * F), lit / density
 
     def lines_to_free(
         self, places: Places, s: "mi.Float", t: "mi.Float", rays_per_line: float = 0.0, active: "mi.Bool | bool" = True
@@ -178,18 +175,18 @@ class Gatherer:
         What rays meet behind lobes that are traced shines by itself, too.
         """
         found = self.follow(places, direction, number, seed, rays_per_line, active)
-        return found.glow + self.reflected_by(found), found.lamps + found.sky
+        return found.glow + self.reflected_by(found.end), found.lamps + found.sky
 
     @property
     def glows(self) -> bool:
         """May rays find light that is neither of lamps nor of leaves?"""
         return self._model.rays.lobes is not None or self._looks
 
-    def reflected_by(self, found: Found) -> "mi.Color3f":
-        """H from the leaves that rays have found (Color3f [n])."""
-        on_leaf = found.leaf != NONE
-        weight = found.weight * self.share_in_sight(found.leaf, found.patch, found.u, found.v, on_leaf)
-        return dr.select(on_leaf, weight * dr.gather(mi.Color3f, self._reflected, found.leaf, on_leaf), 0)
+    def reflected_by(self, end: PathEnd) -> "mi.Color3f":
+        """ρ H of the leaves that paths end on, times their weights (Color3f [n])."""
+        on_leaf = end.leaf != NONE
+        weight = end.weight * self.share_in_sight(end.leaf, end.patch, end.u, end.v, on_leaf)
+        return dr.select(on_leaf, weight * dr.gather(mi.Color3f, self._reflected, end.leaf, on_leaf), 0)
 
     def follow(
         self,
@@ -202,47 +199,34 @@ class Gatherer:
     ) -> Found:
         """What `rays` find, the light of leaves as links to them."""
         model, patches = self._model, self._model.patches
-        origin = places.x + patches.origin + places.normal * patches.lift
-        hit = model.rays.follow(origin, direction, number, seed, active=active, highlights=self.highlights)
-        met = active & (hit.patch != NONE)
-        leaf = dr.select(met, self._elements.leaf_at(hit.patch, hit.u, hit.v, met), NONE)
-        end = leaf, hit.patch, hit.u, hit.v
-        lit = self._by_sharp_light(places, hit, leaf, number, seed)
-        emission = model.lights.at(patches, hit.patch, hit.u, hit.v, met)
-        if model.rays.lobes is None:
-            sky = self._sky(places, direction, active & ~hit.valid, rays_per_line)
-            lamps = emission * self._share_of_rays(places, hit, met, rays_per_line)
-            return Found(lamps, sky, lit, *end, mi.Color3f(1))
-        straight = met & ~hit.bounced
-        lamp = emission * dr.select(straight, self._share_of_rays(places, hit, straight, rays_per_line), 0)
-        sky = self._sky(places, direction, active & ~hit.valid & ~hit.bounced, rays_per_line)
-        seen = dr.select(met & hit.bounced & ~hit.coated, emission, 0)
-        # Where the last lobe was smooth, only rays that are shot find a sun.
-        left_to_shooting = self.is_sharp_sky(hit.direction) & (hit.share == 1)
-        seen += model.lights.sky(hit.direction, active & ~hit.valid & hit.bounced & ~left_to_shooting)
-        glow = dr.select(active, hit.glow + hit.weight * (seen * hit.share + lit), 0)
-        return Found(lamp, sky, glow, *end, hit.weight)
+        ray = mi.Ray3f(places.x + patches.origin + places.normal * patches.lift, direction)
+        met = model.rays.meet(ray.o, ray.d, active)
+        hit = model.rays.locate(met, ray.d)
+        lit = active & (hit.patch != NONE)
+        share = self._share_of_rays(places, hit, lit, rays_per_line)
+        lamps = model.lights.at(patches, hit.patch, hit.u, hit.v, lit) * share
+        sky = self._sky(places, direction, active & ~hit.valid, rays_per_line)
+        end = self.paths.follow(met, hit, ray, number, seed, active, reads=True, scattered=True)
+        glow = end.light + end.weight * self.by_sharp_light(places.x, end, number, seed)
+        return Found(lamps, sky, dr.select(active, glow, 0), end)
 
     def is_sharp_sky(self, direction: "mi.Vector3f") -> "mi.Bool":
         """Is light of the sky sharp there, and left out of the leaves' (Bool [n])?"""
-        sky = self._model.lights.sky_light
-        if not self._looks or sky is None or not sky.may_be_sharp:
-            return mi.Bool(False)
-        return sky.is_sharp(direction)
+        return _is_sun(self._model, self._looks, direction)
 
-    def _by_sharp_light(self, places, hit, leaf, number, seed):
-        """ρ H of sharp light where rays end on leaves, if they are to look for it (Color3f [n])."""
-        H, met, patches = mi.Color3f(0), leaf != NONE, self._model.patches
+    def by_sharp_light(self, start: "mi.Point3f", end: PathEnd, number: "mi.UInt32", seed: "mi.UInt32") -> "mi.Color3f":
+        """ρ H of delta direct light where paths that come from ``start`` end on leaves (Color3f [n])."""
+        H, met, patches, leaf = mi.Color3f(0), end.leaf != NONE, self._model.patches, end.leaf
         if not self._looks:
             return H
-        patch = dr.select(met, hit.patch, 0)
-        x, normal = patches.point(patch, hit.u, hit.v), dr.gather(mi.Vector3f, patches.normal, patch)
+        patch = dr.select(met, end.patch, 0)
+        x, normal = patches.point(patch, end.u, end.v), dr.gather(mi.Vector3f, patches.normal, patch)
         s, t = (uniform(number, seed ^ salt) for salt in (0x51AB1E, 0x0DDB411))
         looks, known = met, mi.Color3f(0)
         if self._sharp is not None:
             reach = dr.gather(mi.Float, self._reach, leaf, met) * uniform(number, seed ^ 0xAFA4)
             crossed = dr.gather(mi.UInt32, self._exposure.slot, leaf, met) != NONE
-            looks = met & (crossed | (dr.squared_norm(x - places.x) < dr.square(reach)))
+            looks = met & (crossed | (dr.squared_norm(x - start) < dr.square(reach)))
             known = dr.gather(mi.Color3f, self._sharp, leaf, met & ~looks)
         for light in self._free:
             if light.may_be_sharp:
@@ -286,15 +270,21 @@ class Gatherer:
         # F times π r⁴, so that nothing is divided by a small distance.
         n = dr.gather(mi.Vector3f, patches.normal, patch)
         F = rays_per_line * dr.maximum(dr.dot(places.normal, d), 0) * dr.maximum(-dr.dot(n, d), 0)
-        found = met & (density > 0) & self._is_met_by_rays(patch)
+        found = met & (density > 0)
         return dr.select(found, F / (density * (dr.pi * r2 * r2) + F), 0)
 
-    def _is_met_by_rays(self, patch):
-        """Do rays end on these lamps, and not go on through them (Bool [n])?"""
-        materials = self._model.materials
-        if not materials.traced.any():
-            return mi.Bool(True)
-        return ~materials.is_traced(dr.gather(mi.UInt32, self._model.patches.face, patch))
+
+def _of_elements(elements, leaf, patch, u, v, active):
+    """ρ of leaves (Color3f [n])."""
+    return dr.gather(mi.Color3f, elements.reflectance, leaf, active)
+
+
+def _is_sun(model, looks, direction):
+    """Is light of the sky from directions sharp, and left out of the cache, if anything of that is (Bool [n])?"""
+    sky = model.lights.sky_light
+    if not looks or sky is None or not sky.may_be_sharp:
+        return mi.Bool(False)
+    return sky.is_sharp(direction)
 
 
 def _reach(elements):

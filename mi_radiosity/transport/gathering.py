@@ -199,7 +199,9 @@ class _Pass:
         # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
         first = flow.rays * flow.first_share * (GLANCE if self._problem.model.rays.lobes is None else 1)
         noise = lost / (1 - lost) / max(first, 1)
-        trust = 1 / (1 + noise * self._count)
+        # Power rays take every diffuse lobe as Lambertian, so that their totals are off by some per cent where there are
+        # others beside it.
+        trust = 0 if self._problem.model.materials.mixed else 1 / (1 + noise * self._count)
         for light, more, shown, total in zip((direct, indirect), added, have, want):
             factors = [1 + trust * (w / h - 1) if h > 0 else 1.0 for w, h in zip(total, shown)]
             light = [h * dr.opaque(mi.Float64, f) for h, f in zip(light, factors)]
@@ -240,7 +242,7 @@ class _Pass:
             met = self._gatherer.follow(places, direction, sample, seed, RAYS_PER_LINE, on_top)
             lamps, shone = (met.lamps + met.sky) / RAYS_PER_LINE, met.glow / RAYS_PER_LINE
             sharp = dr.select(self._gatherer.is_sharp_sky(direction), met.sky / RAYS_PER_LINE, 0)
-            found = shone + self._gatherer.reflected_by(met)
+            found = shone + self._gatherer.reflected_by(met.end)
         if line or self._gatherer.glows:
             other.add(found if line else shone, row, on_top, runs=True)
         self._direct.add(lamps, row, on_top, runs=True)
@@ -249,9 +251,9 @@ class _Pass:
         light = dr.sum(lamps + found)
         slot = dr.gather(mi.UInt32, problem.exposure.slot, leaf)
         if problem.exposure.slots:
-            dr.eval(slot, u, v, on_top, light, [] if line else [*met.end, met.weight])  # lest the rays be traced again
+            dr.eval(slot, u, v, on_top, light, [] if line else met.end)  # lest the rays be traced again
         if not line:
-            links.keep(sample, met, on_top)
+            links.keep(sample, met.end, on_top)
         self._landings.offer(
             slot, u, v, sample ^ (0 if line else 0x80000000), on_top & (light > 0) & (slot != NONE), light
         )

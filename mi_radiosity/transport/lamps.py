@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, Distribution, lower_bound_within, opaque_index, totals
+from ..core.arrays import NONE, Distribution, concat, lower_bound_within, opaque_index, totals
 from ..mesh import MAX_LEVEL, Elements
 
 MOST = 1 << 24  # entries of the table of elements and lamps; with more lamps than that, they are chosen by power
@@ -72,7 +72,12 @@ class LampChoice:
         guess = share * here * there / (r2 + spread)
         total = dr.repeat(dr.block_sum(guess, self.count), self.count)
         chance = dr.select(total > 0, (1 - BY_POWER) * guess / total, (1 - BY_POWER) * share) + BY_POWER * share
-        self._rows = dr.block_prefix_reduce(dr.ReduceOp.Add, chance, self.count, exclusive=False)
+        rows = dr.block_prefix_reduce(dr.ReduceOp.Add, chance, self.count, exclusive=False)
+        # One more row, for points that lie on no element: by power alone.
+        self._rows, self._row_of_others = (
+            concat(rows, mi.Float(self._by_power.shares())),
+            opaque_index(dr.width(places)),
+        )
         self._row = dr.full(mi.UInt32, NONE, len(e))
         dr.scatter(self._row, dr.arange(mi.UInt32, dr.width(places)), places)
         above = _above(e, level)
@@ -84,7 +89,7 @@ class LampChoice:
 
     def draw(self, lot: "mi.Float", leaf: "mi.UInt32 | None" = None) -> "tuple[mi.UInt32, mi.Float]":
         """A lamp drawn with ``lot`` in [0, 1) for places on leaves: its patch, and the density of points on it, 1/m²
-        (UInt32, Float [n]). Without leaves, by power."""
+        (UInt32, Float [n]). Without leaves, and where they are NONE, by power."""
         if leaf is None or self._rows is None:
             number = self._by_power.at(mi.Float64(lot) * dr.opaque(mi.Float64, self._by_power.whole))
         else:
@@ -103,9 +108,9 @@ class LampChoice:
         return dr.select(is_lamp, self._density(dr.select(is_lamp, number, 0), leaf), 0)
 
     def _first(self, leaf):
-        """Where the rows of leaves begin; for other elements, which nobody looks at, the first (UInt32 [n])."""
-        row = dr.gather(mi.UInt32, self._row, leaf)
-        return dr.select(row == NONE, 0, row) * opaque_index(self.count)
+        """Where the rows of leaves begin; the last row serves NONE, and elements that have no row (UInt32 [n])."""
+        row = dr.select(leaf != NONE, dr.gather(mi.UInt32, self._row, leaf, leaf != NONE), NONE)
+        return dr.select(row == NONE, self._row_of_others, row) * opaque_index(self.count)
 
     def _density(self, number, leaf):
         if leaf is None or self._rows is None:

@@ -5,7 +5,8 @@ import mitsuba as mi
 
 from ..core.arrays import NONE, opaque_index
 from ..mesh import Exposure
-from .gather import Found, Gatherer
+from .gather import Gatherer
+from .paths import PathEnd
 
 LANES = 8  # sums per row, side by side
 
@@ -27,17 +28,19 @@ class Links:
         self._at_walls: list[list] = []  # numbers and ends of rays, launch by launch
         self._weight = dr.zeros(mi.Color3f, count) if weighs or exposure.slots else None
 
-    def keep(self, number: "mi.UInt32", found: Found, active: "mi.Bool") -> None:
+    def keep(self, number: "mi.UInt32", end: PathEnd, active: "mi.Bool") -> None:
         """Keep rays of a number each (UInt32 [n])."""
-        dr.scatter(self._leaf, found.leaf, number, active)
+        dr.scatter(self._leaf, end.leaf, number, active)
         if self._weight is not None:
-            dr.scatter(self._weight, found.weight, number, active)
+            dr.scatter(self._weight, end.weight, number, active)
         if self._exposure.slots:
-            active = active & (found.leaf != NONE)
-            crossed = active & (dr.gather(mi.UInt32, self._exposure.slot, found.leaf, active) != NONE)
+            active = active & (end.leaf != NONE)
+            crossed = active & (dr.gather(mi.UInt32, self._exposure.slot, end.leaf, active) != NONE)
             chosen = dr.compress(crossed)
             if dr.width(chosen):
-                self._at_walls.append([dr.gather(type(x), x, chosen) for x in (number, *found.end)])
+                self._at_walls.append(
+                    [dr.gather(type(x), x, chosen) for x in (number, end.leaf, end.patch, end.u, end.v)]
+                )
                 dr.eval(self._at_walls[-1])
 
     def look(self, gatherer: Gatherer) -> None:

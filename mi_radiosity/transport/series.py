@@ -179,7 +179,7 @@ class _Series:
     def _cast(self, batch, tally, landings, direct, focused):
         problem = self.problem
         seed = opaque_index(stream_seed(self.seed, Stream.LOBES, self.iteration))
-        hit = problem.model.rays.follow(batch.origin, batch.direction, batch.number, seed, power=True)
+        hit = problem.model.rays.follow(batch.origin, batch.direction, batch.number, seed)
         pair = pair_of(problem, batch, hit)
         receiver = self.how.deposit(problem, hit, pair)
         on_patch = hit.patch != NONE

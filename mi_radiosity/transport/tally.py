@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.arrays import NONE, ColorSums, opaque_index
-from ..scene.hit import Hit, Trail
+from ..scene.hit import Hit
 from .emit import Batch
 
 
@@ -20,11 +20,11 @@ class Tally:
         self._elements, self._lobes = elements, lobes
         self.sums = ColorSums(elements + (4 if lobes else 2), [8 * u for u in unshot])
 
-    def add(self, batch: Batch, hit: Hit | Trail, receiver: "mi.UInt32", active: "mi.Bool | bool" = True) -> None:
+    def add(self, batch: Batch, hit: Hit, receiver: "mi.UInt32", active: "mi.Bool | bool" = True) -> None:
         """Rays of a Batch end at hits; those on patches are for elements ``receiver``."""
         lost = dr.select(hit.valid, self._bin(self.BLOCKED), self._bin(self.ESCAPED))
         power = batch.power
-        if isinstance(hit, Trail):
+        if self._lobes:
             every = dr.zeros(mi.UInt32, dr.width(receiver))
             taken = [p * mi.Float64(t) for p, t in zip(power, hit.taken)]
             self.sums.add(power, every + self._bin(self.SENT), active, runs=True)
