@@ -52,8 +52,8 @@ def test_rough_metal_mirrors_lamps_as_path_sees_them(name):
 
 
 def variance(images):
-    """Variance between images of different seeds, without the hundredth of the pixels where it is largest: single bright
-    paths that both find by chance say nothing."""
+    """Variance between images of different seeds, without the hundredth of the pixels where it is largest: single
+    bright paths that both find by chance say nothing."""
     each = np.sort(images.var(axis=0, ddof=1).ravel())
     return each[: int(0.99 * len(each))].mean()
 

@@ -64,15 +64,18 @@ class Shader:
 
     @cached_property
     def paths(self) -> Paths:
-        """What follows camera rays past surfaces that are not plainly diffuse, to where `radiance` is asked for."""
-        model = self.solution.model
-        return Paths(
-            model, self.solution.elements, partial(_at_points, model), partial(_sun_is_left_out, self.solution)
-        )
+        """What follows camera rays past surfaces that are not plainly diffuse."""
+        return paths_to_points(self.solution)
 
     def at_end(self, look: Look, end: PathEnd, number: "mi.UInt32", seed: "mi.UInt32") -> "mi.Color3f":
         """What camera paths bring from where they end (Color3f [rays]). number, seed: see `Paths.follow`."""
         return self.radiance(look) if self.colors else end.weight * self.radiance(look)
+
+
+def paths_to_points(solution: Solution) -> Paths:
+    """Camera paths that read a solution from their first vertex on, its ρ at points, textures and all."""
+    model = solution.model
+    return Paths(model, solution.elements, partial(_at_points, model), partial(_sun_is_left_out, solution))
 
 
 def _at_points(model, leaf, patch, u, v, active):
@@ -202,7 +205,7 @@ class Direct(Gather):
 
     def __init__(self, solution: Solution) -> None:
         super().__init__(solution)
-        self.paths = Shader.paths.func(self)
+        self.paths = paths_to_points(solution)
         self._field = Field(solution, solution.indirect)
 
     def irradiance(self, look: Look) -> "mi.Color3f":

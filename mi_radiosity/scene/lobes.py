@@ -20,9 +20,9 @@ ANY = 1 << 30  # recordings for a scene: one for every pattern of widths
 class Lobes:
     """Follows power rays in a scene some of whose shapes are not plainly diffuse.
 
-    At every such surface one lobe is sampled by Mitsuba's `bsdf.sample`, for the transport of importance. A diffuse lobe
-    ends the ray. Its weight over the mean reflectance ρ of the patch multiplies the power that arrives, so that the mean
-    of what the patch receives is what arrives there. Any other lobe sends the ray on.
+    At every such surface one lobe is sampled by Mitsuba's `bsdf.sample`, for the transport of importance. A diffuse
+    lobe ends the ray. Its weight over the mean reflectance ρ of the patch multiplies the power that arrives, so that
+    the mean of what the patch receives is what arrives there. Any other lobe sends the ray on.
     """
 
     def __init__(self) -> None:

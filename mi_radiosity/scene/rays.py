@@ -107,8 +107,8 @@ class Rays:
         seed: "mi.UInt32",
         active: "mi.Bool | bool" = True,
     ) -> Hit:
-        """Where power rays end: on the patch that they hit first, or, past surfaces that are not plainly diffuse, on the
-        first one whose diffuse lobe is sampled (see `Lobes`).
+        """Where power rays end: on the patch that they hit first, or, past surfaces that are not plainly diffuse, on
+        the first one whose diffuse lobe is sampled (see `Lobes`).
 
         number: UInt32 [rays], seed: UInt32, what the random numbers are made from.
         """

@@ -199,8 +199,8 @@ class _Pass:
         # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
         first = flow.rays * flow.first_share * (GLANCE if self._problem.model.rays.lobes is None else 1)
         noise = lost / (1 - lost) / max(first, 1)
-        # Power rays take every diffuse lobe as Lambertian, so that their totals are off by some per cent where there are
-        # others beside it.
+        # Power rays take every diffuse lobe as Lambertian, so that their totals are off by some per cent where there
+        # are others beside it.
         trust = 0 if self._problem.model.materials.mixed else 1 / (1 + noise * self._count)
         for light, more, shown, total in zip((direct, indirect), added, have, want):
             factors = [1 + trust * (w / h - 1) if h > 0 else 1.0 for w, h in zip(total, shown)]

@@ -1,9 +1,9 @@
 """Paths past surfaces that are not plainly diffuse, to where the cache of radiosity ends them.
 
-Every vertex evaluates Mitsuba's own BSDF f in Mitsuba's own shading frame: one shadow ray to an area emitter, one to each
-other emitter, and one continuation by `bsdf.sample`, weighted by the power heuristic (Veach 1997, eq. 9.13). The cache
-holds, for every element, the exitance ρ H of its diffuse lobe. As f = ρ/π + (f − ρ/π) for any ρ, a path that reads the
-cache at a vertex goes on from there with f − ρ/π in the place of f, and nothing is lost or counted twice.
+Every vertex evaluates Mitsuba's own BSDF f in Mitsuba's own shading frame: one shadow ray to an area emitter, one to
+each other emitter, and one continuation by `bsdf.sample`, weighted by the power heuristic (Veach 1997, eq. 9.13). The
+cache holds, for every element, the exitance ρ H of its diffuse lobe. As f = ρ/π + (f − ρ/π) for any ρ, a path that
+reads the cache at a vertex goes on from there with f − ρ/π in the place of f, and nothing is lost or counted twice.
 """
 
 from collections.abc import Callable, Sequence
@@ -70,8 +70,8 @@ class _Vertex:
 class Paths:
     """Follows paths through a Model whose leaves (of ``elements``) hold a cache.
 
-    reflectance(leaf, patch, u, v, active): the ρ that the cache has at points (Color3f [n]). caustic: irradiance that no
-    path can find (Color3f [elements]), added at vertices where the cache is not read; None if there is none.
+    reflectance(leaf, patch, u, v, active): the ρ that the cache has at points (Color3f [n]). caustic: irradiance that
+    no path can find (Color3f [elements]), added at vertices where the cache is not read; None if there is none.
     left_out(direction): is light from there found by power rays alone, after a delta lobe (Bool [n])?
     """
 
@@ -100,9 +100,9 @@ class Paths:
     ) -> PathEnd:
         """Where paths end whose first hits are known; what these emit is the caller's to count.
 
-        met, hit: the first hits. number (UInt32 [n]), seed (UInt32): what random numbers are made from. reads: the cache
-        is read from the first hit on, else once a wide lobe has scattered the path. scattered: a diffuse lobe came
-        before. first: six uniform numbers (Float [n]) for the first vertex, three for a shadow ray and three for
+        met, hit: the first hits. number (UInt32 [n]), seed (UInt32): what random numbers are made from. reads: the
+        cache is read from the first hit on, else once a wide lobe has scattered the path. scattered: a diffuse lobe
+        came before. first: six uniform numbers (Float [n]) for the first vertex, three for a shadow ray and three for
         `bsdf.sample`.
         """
         leaf = self._leaf(hit, active)
