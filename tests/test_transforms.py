@@ -110,8 +110,8 @@ def test_directional_areas_shine_whatever_the_transform(kind, mirrored):
     to_world = T().scale([-0.5 if mirrored else 0.5, 0.5, 0.5])
     emitter = {"type": "directionalarea", "radiance": {"type": "rgb", "value": 1.0}}
     walls = {
-        "above": rectangle(T().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(0)),
-        "below": rectangle(T().translate([0, 0, -1]), bsdf=diffuse(0)),
+        "above": rectangle(T().translate([0, 0, 1]).rotate([1, 0, 0], 180), bsdf=diffuse(0.1)),
+        "below": rectangle(T().translate([0, 0, -1]), bsdf=diffuse(0.1)),
     }
     panel = {"type": kind, "to_world": to_world, "bsdf": diffuse(0), "emitter": emitter}
     solution = mr.solve(scene(panel=panel, **walls), mr.Uniform(), elements=100, rays=10_000)
