@@ -13,12 +13,15 @@ LEAST = 1e-10  # weight; what is certain gives way if nothing else can
 
 
 def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarray, sums: np.ndarray) -> tuple:
-    """X'_ij = X_ij exp(w_ij (y_i + y_j)) and O'_ki = O_ki exp(v_ki y_i) with Σ_j X'_ij + Σ_k O'_ki = s_i.
+    """X'_ij = X_ij g(w_ij (y_i + y_j)) and O'_ki = O_ki g(v_ki y_i) with Σ_j X'_ij + Σ_k O'_ki = s_i.
+
+    g(t) is 1 + t for t > 0 and exp(t) for t < 0: entries grow as in least squares, and shrink without changing sign.
+    An exponential on both sides would let one entry of large variance explode where a sure row needs a large y.
 
     matrix: X, symmetric and ≥ 0 (SciPy CSR [n, n]); weight: w of its entries, symmetric, their relative variances;
     outside, give: O and v [k, n]; sums: s ≥ 0 [n]. X' is symmetric and ≥ 0, and keeps zeros; entries change in
     proportion to their variance, which to first order is the least change in units of their errors. y minimises the
-    convex Σ ½ X'/w + Σ O'/v − Σ s y, by Newton's method. Returns the data of X', and O'. Rows that are empty, or whose
+    convex function whose gradient is the excess of the sums, by Newton's method. Returns the data of X', and O'. Rows that are empty, or whose
     sum is 0, stay as they are; the best y met is used where none fits, as with two facets of different size that see
     nothing but each other.
     """
@@ -30,40 +33,43 @@ def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarr
     inner, slopes = (like(matrix, np.empty(matrix.nnz)) for _ in range(2))  # filled again and again
 
     def at(y):
-        """Fill X'; O', and by how much rows miss their sums."""
+        """Fill X' and ∂X'/∂y; O' and ∂O'/∂y, and by how much rows miss their sums."""
         data = np.take(y, matrix.indices, out=inner.data, mode="clip")
-        with np.errstate(over="ignore", invalid="ignore"):
-            data += np.repeat(y, each)
-            data *= weight
-            np.exp(data, out=data)
-            data *= matrix.data
-            outer = outside * np.exp(give * y)
-            return outer, np.where(idle, 0.0, inner @ ones + outer.sum(axis=0) - target)
+        data += np.repeat(y, each)
+        data *= weight
+        np.exp(np.minimum(data, 0, out=slopes.data), out=slopes.data)
+        np.maximum(data, 0, out=data)
+        data += slopes.data
+        data *= matrix.data
+        slopes.data *= matrix.data
+        slopes.data *= weight
+        shrunk = np.exp(np.minimum(give * y, 0))
+        outer = outside * (np.maximum(give * y, 0) + shrunk)
+        return outer, outside * shrunk * give, np.where(idle, 0.0, inner @ ones + outer.sum(axis=0) - target)
 
     y = best = np.zeros(len(sums))
-    (outer, miss), least = at(y), np.inf
+    (outer, outer_slopes, miss), least = at(y), np.inf
     for _ in range(ROUNDS):
         error = np.abs(miss / target).max(initial=0)
         if error < least:
             best, least = y, error
         if error < CLOSE:
             break
-        np.multiply(inner.data, weight, out=slopes.data)
-        diagonal = np.where(idle, 1.0, slopes @ ones + (outer * give).sum(axis=0))
+        diagonal = np.where(idle, 1.0, slopes @ ones + outer_slopes.sum(axis=0))
         hessian = linalg.LinearOperator(matrix.shape, lambda v: diagonal * v + slopes @ v)
         jacobi = linalg.LinearOperator(matrix.shape, lambda v: v / diagonal)
         with np.errstate(all="ignore"):  # singular where no y fits
             accuracy = np.clip(error, *ACCURACY)
             step = np.nan_to_num(linalg.cg(hessian, -miss, rtol=accuracy, maxiter=300, M=jacobi)[0])
         slope, length = miss @ step, 1.0
-        outer, miss = at(y + step)
+        outer, outer_slopes, miss = at(y + step)
         # The slope along the step only grows: halve until it is small enough.
         while abs(miss @ step) > 0.9 * abs(slope) and length > 1e-6:
             length /= 2
-            outer, miss = at(y + length * step)
+            outer, outer_slopes, miss = at(y + length * step)
         y = y + length * step
     if y is not best:
-        outer, _ = at(best)
+        outer, *_ = at(best)
     return inner.data, outer
 
 

@@ -255,7 +255,9 @@ class DirectionalArea(Free):
         n, pad = dr.width(point), dr.opaque(mi.Float, 2.0**-14 * np.linalg.norm(self.high - self.low))
         towards = -self._normal + dr.zeros(mi.Vector3f, n)
         si = self.scene.ray_intersect(mi.Ray3f(point + towards * pad, towards))
-        met = (si.shape == mi.ShapePtr(self.emitter.get_shape())) & (dr.dot(si.n, self._normal) > 0.9)
+        # The ray runs against the emission of a flat shape, so it hits the front. Mitsuba's si.n is no proof of the
+        # side: it points backwards on mirrored rectangles.
+        met = si.shape == mi.ShapePtr(self.emitter.get_shape())
         _, radiance = self.emitter.sample_wavelengths(si, 0.0, met)
         return towards, dr.select(met, si.t + 0.5 * pad, 1), dr.select(met, _sound(radiance, n), 0)
 

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import owned_vectors
 from ..core.plugins import Registry
 
 FEWEST, MOST = 12, 72  # segments around a shape
@@ -127,7 +128,7 @@ def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":
         box = shape.bbox()
         extent = np.linalg.norm(np.array(box.max) - np.array(box.min))
         if part.to_world is not None:
-            extent *= np.cbrt(abs(np.linalg.det(part.to_world[:3, :3])))
+            extent *= np.linalg.norm(part.to_world[:3, :3], 2)  # the direction that the instance stretches most
         shape = MESHERS.find(shape.class_name())(shape, min(float(extent) / max(scene_size, 1e-30), 1.0))
     return shape if part.to_world is None else placed(shape, part.to_world)
 
@@ -210,18 +211,41 @@ def segments(share: float) -> int:
     return 4 * int(np.ceil(np.clip(wanted, FEWEST, MOST) / 4))
 
 
-def _standing(shape, vertices, faces, uv, normals=None):
-    """A mesh of a shape whose vertices [n, 3] and normals are given before ``to_world``; faces are turned so that they
-    look where the normals do, for flat shapes along z."""
-    matrix = transform_of(shape)
-    up = normals if normals is not None else np.array([[0.0, 0.0, 1.0]])
-    up = _unit(up @ np.linalg.inv(matrix[:3, :3]))
-    vertices, flipped = vertices @ matrix[:3, :3].T + matrix[:3, 3], shape.has_flipped_normals()
+def _in_world(shape, linear, vertices, faces, uv, normals=None):
+    """The mesh of a shape from its object space: vertices [n, 3] and outward normals [n, 3], +z for flat shapes.
+
+    linear: the transform of ``vertices`` without its translation [3, 3]. Faces are oriented along the normals. Mitsuba
+    decides which side is the front, because ``flip_normals`` and mirrored transforms combine differently per shape.
+    """
+    vertices = vertices @ linear.T + transform_of(shape)[:3, 3]
+    up = _unit((normals if normals is not None else np.array([[0.0, 0.0, 1.0]])) @ np.linalg.inv(linear))
+    every = np.broadcast_to(up, vertices.shape)
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    if (cross * up[faces[:, 0] if normals is not None else [0]]).sum() < 0:
+    if (cross * every[faces[:, 0]]).sum() < 0:
         faces = faces[:, ::-1]
+    middle = corners.mean(axis=1)  # off the centre of a disk, where its parametrisation is singular
+    front = _vectors(surface_at(shape, middle, every[faces[:, 0]]).sh_frame.n)
+    flipped = bool((front * every[faces[:, 0]]).sum() < 0)
     return build_mesh(shape, vertices, faces, None if normals is None else up, uv, flipped)
+
+
+def surface_at(shape: "mi.Shape", points: np.ndarray, normals: np.ndarray) -> "mi.SurfaceInteraction3f":
+    """Mitsuba's surface interactions where rays against ``normals`` hit a sphere, a cylinder or a disk at ``points``.
+
+    points, normals: [n, 3], m and unit length, in world space. No ray is traced: the points are taken as hits.
+    """
+    n = len(points)
+    prelim = dr.zeros(mi.PreliminaryIntersection3f, n)
+    prelim.valid, prelim.t, prelim.shape = dr.full(mi.Bool, True, n), 0.0, mi.ShapePtr(shape)
+    ray = dr.zeros(mi.Ray3f, n)
+    ray.o, ray.d = owned_vectors(mi.Point3f, points), owned_vectors(mi.Vector3f, -normals)
+    return prelim.compute_surface_interaction(ray, mi.RayFlags.All)
+
+
+def _vectors(array):
+    """A Dr.Jit array of vectors as NumPy rows (float64 [n, 3])."""
+    return np.array(array, dtype=np.float64).T
 
 
 @mesher("Disk")
@@ -250,7 +274,7 @@ def disk_mesh(disk: "mi.Shape", share: float) -> "mi.Mesh":
         first = inner
     uv, faces = np.vstack(rings), np.vstack(wedges)
     vertices = stretch * uv[:, :1] * _circle(uv[:, 1])
-    return _standing(disk, np.column_stack([vertices, np.zeros(len(uv))]), faces, uv)
+    return _in_world(disk, transform_of(disk)[:3, :3], np.column_stack([vertices, np.zeros(len(uv))]), faces, uv)
 
 
 @mesher("Cylinder")
@@ -266,7 +290,8 @@ def cylinder_mesh(cylinder: "mi.Shape", share: float) -> "mi.Mesh":
     around = _circle(u)
     stretch = np.pi / (n * np.sin(np.pi / n))
     normals = np.column_stack([around, np.zeros(len(u))])
-    return _standing(cylinder, np.column_stack([stretch * around, v]), faces, np.column_stack([u, v]), normals)
+    vertices = np.column_stack([stretch * around, v])
+    return _in_world(cylinder, matrix[:3, :3], vertices, faces, np.column_stack([u, v]), normals)
 
 
 @mesher("Sphere")
@@ -296,7 +321,28 @@ def sphere_mesh(sphere: "mi.Shape", share: float) -> "mi.Mesh":
     normals = np.column_stack([across[:, None] * _circle(uv[:, 0]), height])
     corners = normals[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    return _standing(sphere, np.sqrt(4 * np.pi / area) * normals, faces, uv, normals)
+    linear = transform_of(sphere)[:3, :3]
+    left, scales, right = np.linalg.svd(linear)
+    # Mitsuba traces a round sphere whatever its transform.
+    radius = np.sqrt(float(np.array(sphere.surface_area()).item()) / (4 * np.pi))
+    if not np.allclose(scales, radius, rtol=1e-5):
+        turn = left @ right
+        linear, uv = radius * turn, _texture_of_stretched(sphere, radius, normals @ turn.T, uv)
+    return _in_world(sphere, linear, np.sqrt(4 * np.pi / area) * normals, faces, uv, normals)
+
+
+def _texture_of_stretched(sphere, radius, normals, uv):
+    """Texture coordinates that Mitsuba gives the points of a sphere whose transform is not a similarity [n, 2].
+
+    Mitsuba computes them by the inverse of the transform, and finds no latitude (NaN) at some points: those keep
+    ``uv``, as do the poles, where the longitude is undefined. Longitudes stay within half a turn of ``uv``, so that
+    no triangle spans the seam.
+    """
+    points = transform_of(sphere)[:3, 3] + radius * normals
+    found = np.array(surface_at(sphere, points, normals).uv, dtype=np.float64).T
+    found[:, 0] = uv[:, 0] + (found[:, 0] - uv[:, 0] + 0.5) % 1 - 0.5
+    pole = np.isin(uv[:, 1:], (0, 1))
+    return np.where(np.isfinite(found) & ~pole, found, uv)
 
 
 def _circle(turn):

@@ -24,6 +24,7 @@ OUTSIDE = ("sky", "ground", "backs")  # where rays end that meet no facet
 STRAY = NONE - 1  # where rays end that start next to an edge, behind the neighbour
 CRACK = 2.0**-6  # of the way to the middle, from where a neighbour hides no point that lies before it
 NUDGE = 2.0**-16  # by which a neighbouring ray differs in direction
+COPLANAR = 1 - 1e-6  # cosine between normals from which on two facets cannot see each other
 AT_ONCE = 1 << 22  # rays in one launch: bounds memory, and the time until an interrupt is heard
 
 
@@ -173,17 +174,19 @@ def _ends(facets, cell, numbers, up):
     elements, rays, (x, y, s, t) = facets.elements, facets.model.rays, numbers
     element = dr.gather(mi.UInt32, facets.cells, cell)
     patch, (u, v) = dr.gather(mi.UInt32, elements.patch, element), elements.patch_point(element, *triangle(x, y))
-    met = _met(facets, *rays.leave(patch, u, v, s, t), up)
+    normal = dr.gather(mi.Vector3f, elements.patches.normal, patch)
+    met = _met(facets, normal, *rays.leave(patch, u, v, s, t), up)
     met = dr.select(rays.on_top(patch, u, v), met, NONE)
     dr.eval(met, u, v, s, t)
     n = len(facets)
     doubtful = dr.compress((met >= opaque_index(n)) & (met < opaque_index(n + len(OUTSIDE))))
     if dr.width(doubtful):
         element, patch = (dr.gather(mi.UInt32, a, doubtful) for a in (element, patch))
+        normal = dr.gather(mi.Vector3f, normal, doubtful)
         u, v, s, t = (dr.gather(mi.Float, a, doubtful) for a in (u, v, s, t))
         origin, direction = rays.leave(patch, u, v, s, t)
         # Between two faces a ray may slip through: its neighbour does not.
-        end = _met(facets, origin, dr.normalize(direction + NUDGE * (mi.Vector3f(s, t, u) - 0.5)), up)
+        end = _met(facets, normal, origin, dr.normalize(direction + NUDGE * (mi.Vector3f(s, t, u) - 0.5)), up)
         end = dr.select(_in_a_crack(elements, rays, element, patch, u, v), STRAY, end)
         # Inside a solid: rays that start there go nowhere.
         backs = dr.compress(end == opaque_index(n + OUTSIDE.index("backs")))
@@ -194,11 +197,16 @@ def _ends(facets, cell, numbers, up):
     return met
 
 
-def _met(facets, origin, direction, up):
-    """The cells that rays meet, or cells + a number of OUTSIDE (UInt32 [rays])."""
+def _met(facets, normal, origin, direction, up):
+    """The cells that rays meet, or cells + a number of OUTSIDE (UInt32 [rays]).
+
+    Rays that graze their own plane may hit it by rounding: they count as strays.
+    """
     hit = facets.model.rays.trace(origin, direction)
     on = hit.patch != NONE
     met = dr.gather(mi.UInt32, facets.number_of, facets.cell_at(hit, on), on)
+    own = dr.dot(dr.gather(mi.Vector3f, facets.model.patches.normal, hit.patch, on), normal) > COPLANAR
+    met = dr.select(own, mi.UInt32(STRAY), met)
     sky, ground, backs = (opaque_index(len(facets) + k) for k in range(len(OUTSIDE)))
     return dr.select(on, met, dr.select(hit.valid, backs, dr.select(dr.dot(direction, up) >= 0, sky, ground)))
 

@@ -5,25 +5,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import opaque_index, owned, runs
 from ..core.balance import balance, like
 from ..core.errors import RadiosityError, interruptible
 from ..core.extras import optional
-from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
 from ..mesh import Elements, Tree
 from ..scene import Model
-from ..scene.rays import kernel_in_full_view
 from .contour import exchange_area
-from .facets import AT_ONCE, OUTSIDE, Counts, Facets, count_rays
+from .facets import OUTSIDE, Counts, Facets, count_rays
+from .sample_lines import LINES, visible_sums
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
-FEW = 8  # rays between two cells that lines are worth
-RAMP = 16, 64  # rays to expect between two cells from where on lines count, and decide alone
-LINES = 8  # lines come in blocks of so many
+FEW = 8  # rays that connect two cells from which sample lines are worth their cost
+RAMP = 16, 64  # expected rays between two cells: below the first, rays alone decide; from the second, sample lines alone
+UNSEEN = 2  # rays or sample lines that every error allows for beyond the observed ones (Agresti and Coull)
 
 
 @dataclass(frozen=True)
@@ -123,12 +120,15 @@ def view_factors(
 
 
 class _Exchange:
-    """Exchange areas A_i F_ij: a symmetric SciPy CSR ``area`` [cells, cells], and the ``variance`` of its data."""
+    """Exchange areas A_i F_ij between cells: a symmetric SciPy CSR ``area`` [cells, cells], m².
+
+    In the same places: ``variance``, the sample variance, and ``unit``, the exchange area that one ray or sample line
+    stands for. ``density``: rays per m² [cells]; ``lines``: how many sample lines were traced.
+    """
 
     def __init__(self, facets: Facets, counts: Counts, seed: int, progress: Callable[[int, int], None]) -> None:
         self.facets, self.progress = facets, progress
-        self.seed = opaque_index(stream_seed(seed, Stream.FACTORS, 1))
-        self.density = counts.cast / facets.area  # rays per m²
+        self.density = counts.cast / facets.area
         self.area = counts.met + counts.met.T
         self._of = np.repeat(np.arange(len(facets), dtype=np.int32), np.diff(self.area.indptr))
         count = self.area.data
@@ -137,7 +137,7 @@ class _Exchange:
         chosen = np.flatnonzero(count >= FEW)
         chosen = chosen[self._of[chosen] < self.area.indices[chosen]]
         if len(chosen):
-            self._refine(chosen, count[chosen])
+            self._refine(chosen, seed)
 
     def _by_rays(self):
         """From how many rays connect them, both ways; each way is binomial."""
@@ -155,23 +155,33 @@ class _Exchange:
         variance /= both
         variance /= both
         self.variance = np.maximum(variance, 0, dtype=np.float32)
+        self.unit = np.reciprocal(both, dtype=np.float32)
         self.area = like(self.area, area)
 
-    def _refine(self, chosen, count):
-        """Blend in what lines say of pairs i < j that ``count`` rays connect.
+    def _refine(self, chosen, seed):
+        """Replace the ray estimates of pairs i < j by those of sample lines, where enough rays are to be expected.
 
-        What decides is how many rays should connect them by what the lines say, not how many do: a weight that goes
-        with one of the estimates would shift the mean. Pairs that lines decide have FEW rays all but certainly.
+        There are as many lines as rays would connect the cells in full view. The ratio Σ k V / Σ k is the visible share.
+        The weight of each half of the lines depends on the other half only: a weight that depended on the estimate
+        itself would shift its mean.
         """
-        i, j, corners = self._of[chosen], self.area.indices[chosen], self.facets.corners
-        whole, blocks = exchange_area(corners[i], corners[j]), -(-count // LINES)
-        self.lines = LINES * int(blocks.sum(dtype=np.int64))
-        by_lines, spread = self._visible(i, j, whole, blocks)
-        a = np.clip((by_lines * (self.density[i] + self.density[j]) - RAMP[0]) / (RAMP[1] - RAMP[0]), 0, 1)
-        area = a * by_lines + (1 - a) * self.area.data[chosen]
-        variance = a**2 * spread + (1 - a) ** 2 * self.variance[chosen]
+        i, j = self._of[chosen], self.area.indices[chosen]
+        whole, both = exchange_area(self.facets.corners[i], self.facets.corners[j]), self.density[i] + self.density[j]
+        blocks = 2 * np.ceil((1 + whole * both) / (2 * LINES)).astype(np.int64)
+        self.lines = LINES * int(blocks.sum())
+        k, k2, seen, seen2 = sums = visible_sums(self.facets, i, j, whole, blocks, seed, self.progress)
+        share = _ratio(seen, k)
+        weight = np.clip((whole * both * share - RAMP[0]) / (RAMP[1] - RAMP[0]), 0, 1)[::-1]
+        by_rays = 1 - weight.mean(axis=0)
+        area = by_rays * self.area.data[chosen] + whole * (weight * share).mean(axis=0)
+        k, k2, seen, seen2 = sums.sum(axis=1)
+        share = _ratio(seen, k)
+        spread = whole**2 * _ratio((1 - share) ** 2 * seen2 + share**2 * (k2 - seen2), k**2)
+        variance = by_rays**2 * self.variance[chosen] + (weight**2).mean(axis=0) * spread
+        # A line counts for more where few lines hold most of the kernel: k² / k on average.
+        unit = np.maximum(by_rays * self.unit[chosen], weight.mean(axis=0) * whole * _ratio(k2, k**2))
         for places in (chosen, self._places(j, i)):
-            self.area.data[places], self.variance[places] = area, variance
+            self.area.data[places], self.variance[places], self.unit[places] = area, variance, unit
 
     def _places(self, i, j):
         """Where in the data entries (i, j) are (int [n])."""
@@ -179,56 +189,18 @@ class _Exchange:
         return np.searchsorted(keys, (i.astype(np.int64) << 32) | j)
 
     def rows(self, n):
-        """The same between the ``n`` rows of the facets."""
+        """Exchange areas (SciPy CSR), and their variances and units, between the ``n`` rows of the facets."""
         if n == len(self.facets):
-            return self.area, self.variance
+            return self.area, self.variance, self.unit
         i, j = self.facets.row[self._of], self.facets.row[self.area.indices]
         # Two cells of one row are there twice, with one error.
         variance = self.variance * np.where((i == j) & (self._of != self.area.indices), 2, 1)
         kind = optional("scipy.sparse", "a matrix of view factors", "factors").coo_array
         area, variance = (kind((data, (i, j)), (n, n)).tocsr() for data in (self.area.data, variance))
-        return area, variance.data
-
-    def _visible(self, i, j, whole, blocks):
-        """Exchange areas by ``blocks`` of lines, and their variances (two float64 [pairs]).
-
-        The kernel k along lines, in units of its mean, and what of it is seen, k V: the mean of k V + β (1 − k), where
-        β = cov(k V, k) / var(k). So in full view all variance is gone, and of other pairs that of k near edges that
-        touch, where it is infinite. What n lines all agree on may still be wrong for one in n + 2.
-        """
-        pair, number = runs(blocks)
-        unit = self.facets.area[i] * self.facets.area[j] / np.where(whole > 0, whole, np.inf)
-        sums, most = np.zeros((4, len(pair))), AT_ONCE // LINES
-        for start in range(0, len(pair), most):
-            part = slice(start, start + most)
-            columns = (owned(mi.UInt32, x) for x in (i[pair[part]], j[pair[part]], number[part]))
-            values = self._kernels(*columns, owned(mi.Float, unit[pair[part]]))
-            sums[:, part] = [np.array(dr.block_sum(x, LINES)) for x in values]
-            self.progress(min(start + most, len(pair)), len(pair))
-        lines = LINES * blocks
-        k, k2, seen, seen2 = np.add.reduceat(sums, np.cumsum(blocks) - blocks, axis=1) / lines
-        variance, covariance = k2 - k**2, seen2 - seen * k
-        beta = np.clip(_ratio(covariance, np.where(variance > 1e-6 * k2, variance, 0)), 0, 1)
-        beta = np.where(seen >= k, 1, beta)
-        rest = np.maximum(seen2 - seen**2 - 2 * beta * covariance + beta**2 * variance, 0)
-        share = np.clip(seen + beta * (1 - k), 0, 1)
-        return whole * share, whole**2 * (rest / lines + 1 / (lines + 2.0) ** 2)
-
-    def _kernels(self, i, j, number, unit):
-        """k and k² along the lines of blocks, and the same of what is seen of it (four Float [LINES · blocks])."""
-        e, p, rays = self.facets.elements, self.facets.model.patches, self.facets.model.rays
-        i, j = (dr.gather(mi.UInt32, self.facets.cells, k) for k in (i, j))
-        k = dr.arange(mi.UInt32, LINES * dr.width(i))
-        of = k // LINES
-        index = LINES * dr.gather(mi.UInt32, number, of) + k % LINES
-        x0, x1, y0, y1 = kronecker(index, hash_pair(e.key(i), e.key(j)), self.seed, of)
-        i, j = dr.gather(mi.UInt32, i, of), dr.gather(mi.UInt32, j, of)
-        x, y = e.patch_point(i, *triangle(x0, x1)), e.patch_point(j, *triangle(y0, y1))
-        i, j = dr.gather(mi.UInt32, e.patch, i), dr.gather(mi.UInt32, e.patch, j)
-        n_i, n_j = (dr.gather(mi.Vector3f, p.normal, k) for k in (i, j))
-        k = kernel_in_full_view(p.point(i, *x), n_i, p.point(j, *y), n_j) * dr.gather(mi.Float, unit, of)
-        seen = dr.select(rays.kernel(i, *x, j, *y) > 0, k, 0)
-        return k, k * k, seen, seen * seen
+        keys, entry = np.unique(i.astype(np.int64) * n + j, return_inverse=True)
+        unit = np.zeros(len(keys))
+        np.maximum.at(unit, entry, self.unit)
+        return area, variance.data, unit
 
 
 # ---- From exchange areas to a matrix -----------------------------------------------------------------
@@ -237,7 +209,7 @@ class _Exchange:
 def _closed(facets, counts, flow, start):
     """The matrix of the rows, closed."""
     n, row = len(facets.names), facets.row
-    X, V = flow.rows(n)
+    X, V, unit = flow.rows(n)
     ray = 1 / flow.density  # m² per ray
     areas = np.bincount(row, weights=counts.kept * ray, minlength=n)
     there = np.flatnonzero(counts.outside.any(axis=0))
@@ -254,7 +226,9 @@ def _closed(facets, counts, flow, start):
         inner = inner * np.repeat(over, np.diff(X.indptr)).astype(inner.dtype)
         return _with_columns(like(X, inner), outer * over)
 
-    F, error = matrix(closed, beyond), matrix(np.sqrt(V) * _ratio(closed, X.data), np.sqrt(P) * _ratio(beyond, O))
+    F = matrix(closed, beyond)
+    unseen = np.array([_largest(ray, row, n)] * len(there)).reshape(-1, n)
+    error = matrix(np.sqrt(V + UNSEEN * unit**2), np.sqrt(P + UNSEEN * unseen**2))
     closed -= X.data
     closed *= np.repeat(over, np.diff(X.indptr))
     change = [np.abs(closed), np.abs((beyond - O) * over).ravel()]
@@ -290,6 +264,13 @@ def _with_columns(matrix, columns):
 def _binomial(counts):
     """Variances of how many rays go where outside [cells, OUTSIDE]."""
     return counts.outside * (1 - counts.outside / np.maximum(counts.kept, 1)[:, None])
+
+
+def _largest(values, row, n):
+    """The largest value of every row, 0 for rows without any (float64 [n])."""
+    largest = np.zeros(n)
+    np.maximum.at(largest, row, values)
+    return largest
 
 
 def _relative(variance, value):
