@@ -70,8 +70,9 @@ class Light:
         raise NotImplementedError
 
     def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
-        """Towards the lamp from points, with two uniform numbers each: unit direction, distance, and the irradiance
-        of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
+        """Towards the lamp from points, with two uniform numbers each: unit direction, distance (infinite for emitters
+        at infinity), and the irradiance of an unblocked surface that faces that way, over the density of the sample
+        (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
 
     def fingerprint(self) -> bytes:
@@ -118,7 +119,7 @@ class Light:
         if only_sharp:
             lit &= sharp
         start = x + normal * rays.patches.lift
-        hidden = rays.blocked(start, start + direction * distance, lit)
+        hidden = rays.blocked_along(start, direction, distance, lit)
         found = dr.select(lit & ~hidden, irradiance * cosine, 0)
         return found * (1 - self.share_of_rays(direction, cosine, rays_per_line)), found, sharp
 
@@ -189,6 +190,12 @@ class Infinite(Free):
         "SunskyEmitter",
         "TimedSunskyEmitter",
     )
+
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
+        """The distance is infinite. Mitsuba's own distance ends at a bounding sphere, and Mitsuba 3.9.1 makes that
+        sphere too small in scenes whose rectangles it has merged (docs/mitsuba_issues.md)."""
+        direction, _, irradiance = super().sample(point, s, t)
+        return direction, dr.full(mi.Float, dr.inf, dr.width(point)), irradiance
 
     @cached_property
     def may_be_sharp(self) -> bool:
@@ -264,7 +271,8 @@ class Lights:
     """The lamps of a scene: ``exitance`` of its faces, the mean of each, W/m² [faces, 3], and the ``free`` ones that
     are no surfaces; ``textured``: does the exitance vary over a face?
 
-    Raises RadiosityError if there is no light where it is ``required``, or if a lamp's is impossible, naming the shape.
+    Raises RadiosityError if there is no emitter where one is ``required``, or if the light of one is impossible, naming
+    the shape.
     """
 
     def __init__(self, faces: Faces, required: bool = True) -> None:
@@ -281,8 +289,7 @@ class Lights:
             self._shape = owned(mi.UInt32, faces.shape)
         self.exitance = self._of_faces(np.flatnonzero(np.array(lamps)[faces.shape]))
         self.free = self._free()
-        lit = (self.exitance * faces.area[:, None]).any() or any(any(light.power()) for light in self.free)
-        if required and not lit:
+        if required and not self._kinds and not self.free:
             raise RadiosityError("the scene has no light: add a lamp, such as an 'area' emitter of a shape")
 
     def _of_faces(self, lamps):
@@ -357,6 +364,12 @@ class Lights:
         si.wi = -direction
         seen = dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
         return dr.pi * seen * self.sky_light.color
+
+    @property
+    def any_power(self) -> bool:
+        """Does any emitter have power?"""
+        on_surfaces = (self.exitance * self._faces.area[:, None]).any()
+        return bool(on_surfaces) or any(any(light.power()) for light in self.free)
 
     @property
     def may_be_sharp(self) -> bool:

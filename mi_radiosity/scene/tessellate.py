@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby, product
 from typing import Any
 
 import drjit as dr
@@ -110,14 +111,36 @@ def tracing_scene(scene: "mi.Scene") -> "tuple[mi.Scene, list[Part]]":
     found = parts(scene)
     if all(part.to_world is None and isinstance(part.shape, mi.Mesh) for part in found):
         return scene, found
-    box = scene.bbox()
-    size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
+    size = _size(found)
     meshes, names = [as_mesh(part, size) for part in found], [part.shape.id() for part in found]
     tracing = mi.load_dict({"type": "scene"} | {f"shape_{i}": mesh for i, mesh in enumerate(meshes)}, optimize=False)
     for part, name in zip(found, names):
         part.shape.set_id(name)  # load_dict has given those that are in both scenes another
     by_pointer = {mesh.ptr: part for mesh, part in zip(meshes, found)}
     return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()]
+
+
+def _size(found):
+    """Length of the diagonal of the box around parts, m. Mitsuba's own boxes are wrong for meshes that Mitsuba 3.9.1
+    has merged (docs/mitsuba_issues.md), so the box of a mesh is that of its vertices."""
+    boxes = []
+    for _, members in groupby(found, key=lambda part: part.number):
+        first, *others = members
+        corners = np.concatenate([_points(part.shape) for part in (first, *others)])
+        if first.to_world is not None and len(corners):  # as Mitsuba bounds an instance: by its group's box
+            corners = np.array(list(product(*zip(corners.min(axis=0), corners.max(axis=0)))))
+            corners = corners @ first.to_world[:3, :3].T + first.to_world[:3, 3]
+        boxes.append(corners)
+    corners = np.concatenate(boxes)
+    return float(np.linalg.norm(np.ptp(corners, axis=0))) if len(corners) else 0.0
+
+
+def _points(shape):
+    """The finite vertices of a mesh, or two corners of the box around another shape (float64 [n, 3])."""
+    if isinstance(shape, mi.Mesh):
+        vertices = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        return vertices[np.isfinite(vertices).all(axis=1)]
+    return np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64).reshape(2, 3)
 
 
 def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":

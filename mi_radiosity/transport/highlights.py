@@ -41,7 +41,8 @@ class Highlights:
             """What becomes of light π L, over its density, from so far along a direction."""
             value, pdf = gloss.light(bsdf, si, si.to_local(direction), share, on)
             on = on & (dr.max(value) > 0)
-            on &= ~rays.scene.ray_test(si.spawn_ray_to(si.p + direction * distance), active=on)
+            near, far = si.spawn_ray_to(si.p + direction * distance), si.spawn_ray(direction)
+            on &= ~rays.scene.ray_test(dr.select(dr.isfinite(distance), near, far), active=on)
             weight = dr.select(density > 0, density / (density + pdf), 1)
             return dr.select(on, value * light * weight, 0)
 
