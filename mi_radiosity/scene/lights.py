@@ -12,12 +12,12 @@ import numpy as np
 from ..core.arrays import opaque_index, owned, owned_vectors, totals
 from ..core.errors import RadiosityError
 from ..core.plugins import Registry
-from ..core.points import kronecker, triangle
+from ..core.points import kronecker
+from .averages import Averages
 from .faces import Faces
 from .state import Parameters
 
 LIGHTS = Registry("emitter")
-LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
 SAMPLES = 1 << 18  # rays that a lamp's power is averaged over
 GLANCES = 1 << 12  # directions in which a sky is looked at for a sun
 SHARP = 300 / (4 * np.pi)  # density over directions, 1/sr, of parts of a sky that are as small and bright as a sun
@@ -282,7 +282,8 @@ class Lights:
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
         self._kinds = list(dict.fromkeys(kind for kind in kinds if kind and kind.on_surface))
         lamps = [kind in self._kinds for kind in kinds]
-        self.textured = any(varies(emitter) for emitter, lamp in zip(emitters, lamps) if lamp)
+        textured = np.array([lamp and varies(emitter) for emitter, lamp in zip(emitters, lamps)], dtype=bool)
+        self.textured, self._averages = bool(textured.any()), Averages(faces, textured[faces.shape])
         if self._kinds:
             self._emitters = mi.EmitterPtr([e if lamp else None for e, lamp in zip(emitters, lamps)])
             self._kind = owned(mi.UInt32, [self._kinds.index(kind) if kind in self._kinds else 0 for kind in kinds])
@@ -337,14 +338,12 @@ class Lights:
         return total
 
     def mean_exitance(self, face: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float") -> "mi.Color3f":
-        """E averaged over triangles (u0 + scale a, v0 + scale b) of faces' fronts (Color3f [n])."""
-        points, step = LATTICE if self.textured else (1, 0)
-        each, k = opaque_index(points), dr.arange(mi.UInt32, dr.width(face) * points)
-        face, u0, v0, scale = (dr.gather(type(x), x, k // each) for x in (face, u0, v0, scale))
-        number = k % each
-        a, b = triangle(*((mi.Float(x % each) + 0.5) / mi.Float(each) for x in (number, number * step)))
-        values = self.exitance_at(face, u0 + scale * a, v0 + scale * b)
-        return mi.Color3f(*(dr.block_sum(x + dr.zeros(mi.Float, dr.width(k)), points) / mi.Float(each) for x in values))
+        """E averaged over triangles (u0 + scale a, v0 + scale b) of faces' fronts (see `Averages`; Color3f [n])."""
+
+        def value(face, u, v, back):
+            return self.exitance_at(face, u, v)
+
+        return self._averages.mean(value, face, dr.full(mi.Bool, False, dr.width(face)), u0, v0, scale)
 
     def at(
         self, patches: Any, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
