@@ -57,15 +57,19 @@ class Averages:
         depth = 127 - ((dr.reinterpret_array(mi.UInt32, entry[4]) >> 23) & 0xFF)  # of the power of two that scale is
         exponent = dr.gather(mi.UInt32, exponent, various)
         exponent = dr.select(exponent > depth + LEAST, exponent - depth, LEAST)
-        sums = self._sums(value, *entry, exponent)
+        sums = self._sums(value, entry, exponent)
         for channel, total in zip(result, sums):
             start = dr.gather(mi.Float, channel, various)
             dr.scatter(channel, start + owned(mi.Float, total), various)
         dr.eval(result)
         return result
 
-    def _sums(self, value, face, back, u0, v0, scale, first, exponent):
-        """Means of value − first over the points of triangles, 4^exponent each (three NumPy [n])."""
+    def _sums(self, value, entry, exponent):
+        """Means of value − first over the points of triangles, 4^exponent each (three NumPy [n]).
+
+        entry: face, back, u0, v0, scale and first.
+        """
+        face, back, u0, v0, scale, first = entry
         count = 4 ** np.array(exponent, dtype=np.int64)
         owner, number = runs(-(-count // CHUNK))
         key = self._keys(face, u0, v0, scale)

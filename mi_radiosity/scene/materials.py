@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
-from ..core.points import Stream, kronecker, stream_seed, triangle
+from ..core.points import Stream, kronecker, permuted, stream_seed, triangle
 from .averages import Averages
 from .faces import Faces
 from .gloss import Gloss, is_glossy
@@ -22,8 +22,8 @@ CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum",
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 WHITEST, ROUNDING = 0.999, 1e-4
 SOLID_SAMPLES = 1 << 15  # for the albedo of a shape
-FACE_SAMPLES, LEAST = 1 << 8, 1 << 6  # of a face of a textured one, and if there are many
-MANY = 1 << 20  # samples of all such faces
+LEAST = 1 << 6  # samples of a face of a textured shape, if there are many; SOLID_SAMPLES if there are few
+MANY = 1 << 20  # samples of all such faces: bounds the work
 AT_ONCE = 1 << 22  # samples in one launch
 
 
@@ -94,7 +94,7 @@ class Materials:
         first = np.searchsorted(shape, np.arange(len(self.traced)))
         solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
         various = np.flatnonzero((self.traced & textured)[shape])
-        each = max(LEAST, min(FACE_SAMPLES, MANY // max(len(various), 1)))
+        each = max(LEAST, min(SOLID_SAMPLES, MANY // max(len(various), 1)))
         for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, each, False)):
             for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
                 for rho, side in zip(self._albedos(part, samples), self.rho):
@@ -120,7 +120,10 @@ class Materials:
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
         key = owned(mi.UInt32, self._faces.rank[faces])  # not Mitsuba's number of the face, which varies
-        x, y, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
+        _, _, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
+        # Points in an order of their own: in the order of directions and lobes, a lobe would see some places only.
+        at = permuted(k % each, each, opaque_index(stream_seed(0, Stream.ALBEDO, 2)))
+        x, y, _, _ = kronecker(at, key, opaque_index(stream_seed(0, Stream.ALBEDO, 3)), k // each)
         a, b, c, _ = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO, 1)), k // each)
         si = self._faces.surface(face, *triangle(x, y))
         wi, gloss = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t)), Gloss(mi.TransportMode.Radiance)
