@@ -234,9 +234,14 @@ def test_who_shares(patches, elements, wanted, shares):
     assert plan(model, elements, None) == (wanted, wanted if shares else None)
 
 
-def test_too_few_elements_are_refused_with_the_fewest(model):
-    with pytest.raises(mr.RadiosityError, match="cannot be reached: of .* ask for [0-9]+ or more"):
-        mr.solve(model, elements=3, rays=10_000)
+def test_too_few_elements_give_the_largest_clusters(model):
+    """Fewer elements than there can be clusters: the largest clusters, and one warning."""
+    solution = mr.solve(model, elements=3, rays=10_000)
+    count = solution.stats["elements"]
+    assert 3 < count < model.patches.count
+    (said,) = (line for line in solution.stats["warnings"] if "instead of 3" in line)
+    assert said.startswith(f"the mesh has {count:,} elements") and "like normals" in said
+    assert np.all(np.isfinite(np.array(solution.radiosity())))
 
 
 def test_the_same_seed_gives_the_same_clusters(model):

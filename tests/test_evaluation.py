@@ -380,7 +380,8 @@ def made_up():
     def row(question, label, seed, error):
         errors = {"rmse_a": error, "rmse_p": error, "psnr_a": -error, "psnr_p": -error}
         clean = {"rmse_a_clean": error, "rmse_a_clean_error": 0.01}
-        return {"question": question, "label": label, "seed": seed, "view": 0, **costs, **errors, **clean}
+        wanted = {"elements_wanted": costs["elements"]}
+        return {"question": question, "label": label, "seed": seed, "view": 0, **wanted, **costs, **errors, **clean}
 
     means = {("mesh", "a<b"): 3, ("mesh", "b"): 5, ("noise", "a<b"): 2, ("noise", "b"): 4}
     rows = [row(q, label, seed, mean + 0.01 * seed) for (q, label), mean in means.items() for seed in (-1, 1)]
@@ -413,6 +414,22 @@ def test_markdown_and_html_show_the_same_rows():
     assert all(f"<td>{f'<b>{t}</b>' if e.best else t}</td>" in shown for e, t in zip(entries, escaped, strict=True))
     assert shown.count("<td>") == len(entries) and "a<b" not in shown
     assert all(line in text and line in shown for line in (found.title, found.footer, *found.notes))
+
+
+@pytest.mark.fast
+def test_oracles_with_fewer_elements_are_marked():
+    """A mark beside the label in every table of the question, and one note that says how many elements there are."""
+    results = made_up()
+    for row in results["rows"]:
+        if (row["question"], row["label"], row["seed"]) == ("mesh", "b", 1):
+            row["elements_wanted"] = 5_000
+    found = tables.report(results, ["b", "a<b"])
+    errors, spent, parts = found.tables
+    assert [table.rows[0][0].text for table in (errors, spent, parts)] == ["b †", "b †", "b"]
+    assert [table.rows[1][0].text for table in found.tables] == ["a<b"] * 3
+    assert found.notes[-1].startswith("† ") and found.notes[-1].endswith("b 9 of 5,000.")
+    assert found.notes[-1] in tables.markdown(found) and found.notes[-1] in page(found, b"png")
+    assert not any("†" in note for note in tables.report(made_up(), ["b", "a<b"]).notes)
 
 
 # ---- Speed and benchmarks --------------------------------------------------------------------------

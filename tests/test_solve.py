@@ -134,7 +134,6 @@ def test_kernels_do_not_grow_with_the_work(cornell):
 @pytest.mark.parametrize(
     "options, says",
     [
-        (dict(elements=10), "patches"),
         (dict(elements=0), "elements"),
         (dict(rays=-5), "rays"),
         (dict(lines=0), "lines"),
@@ -152,10 +151,3 @@ def test_refused_options(cornell, options, says):
 def test_refused_alpha(alpha):
     with pytest.raises(mr.RadiosityError, match="alpha"):
         mr.GMI(alpha)
-
-
-def test_a_budget_the_oracle_cannot_spend():
-    """Two patches of one plane see nothing of each other: there is nothing to refine."""
-    flat = scene(lamp=rectangle(bsdf=diffuse(), emitter=lamp()))
-    with pytest.raises(mr.RadiosityError, match="nothing left to refine"):
-        mr.solve(flat, elements=100, rays=1000)

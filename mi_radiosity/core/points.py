@@ -32,6 +32,7 @@ class Stream(IntEnum):
     LOBES = 8  # what lobes rays draw on their way
     FACTORS = 10  # rays and lines that view factors are made of
     SIGHT = 11  # points of leaves that walls cross, from which their light is looked for
+    AVERAGE = 12  # points that reflectance and emission of faces and elements are averaged over
 
 
 def stream_seed(seed: int, stream: Stream, number: int = 0) -> int:

@@ -83,6 +83,7 @@ def _row(cell: Cell, solution: Solution, view: int, image: np.ndarray, halves: n
     row = {
         "key": cell.key,
         "question": cell.question,
+        "elements_wanted": solution.stats["elements_wanted"],
         "label": cell.oracle,
         "oracle": solution.stats["oracle"],
         "alpha": solution.stats["alpha"],

@@ -1,6 +1,7 @@
 """What a comparison asks and what it finds: questions, budgets, rows of results."""
 
 import json
+import math
 import statistics
 import sys
 from collections.abc import Iterable, Sequence
@@ -37,6 +38,7 @@ class Row(Costs):
 
     key: str
     question: str
+    elements_wanted: int
     label: str
     oracle: str
     alpha: float | None
@@ -68,6 +70,11 @@ def costs(stats: dict[str, Any]) -> Costs:
     return cast(Costs, {name: stats[name] for name in Costs.__annotations__} | {"seconds": stats["seconds"]["total"]})
 
 
+def fell_short(row: Row) -> bool:
+    """Has the mesh fewer elements than were asked for? Solves reach that number to within 3."""
+    return row["elements"] < row["elements_wanted"] - 2
+
+
 def cost(row: Costs, question: str) -> float:
     """What the question makes equal: rays in all, or seconds."""
     return row["seconds"] if question == "time" else row["rays"] + row["oracle_rays"] + row["pilot_rays"]
@@ -85,11 +92,12 @@ def select(rows: Iterable[Row], question: str, label: str, view: int | None = No
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and half-width of its 95 % confidence interval (Student's t; NaN for one value)."""
+    """Mean and half-width of its 95 % confidence interval (Student's t; NaN for one value, or an infinite mean, which
+    is the PSNR of pictures that are the same)."""
     from scipy.stats import t
 
     mean = statistics.mean(values)
-    if len(values) < 2:
+    if len(values) < 2 or not math.isfinite(mean):
         return mean, float("nan")
     return mean, float(t.ppf(0.975, len(values) - 1)) * statistics.stdev(values) / len(values) ** 0.5
 
@@ -139,6 +147,8 @@ def resume(output: Path, fresh: Results) -> Results:
         raise RadiosityError(f"{file} is damaged: remove it to start over") from None
     if kept.get("setting") != fresh["setting"]:
         raise RadiosityError(f"{output} holds a comparison with other settings: choose another folder, or remove it")
+    for row in kept["rows"]:  # earlier versions refused meshes with fewer elements
+        row.setdefault("elements_wanted", row["elements"])
     return kept
 
 

@@ -16,6 +16,7 @@ import OpenEXR
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..scene import Model
+from ..scene.lights import Infinite
 from .metrics import reference_noise
 from .records import make_folder
 
@@ -109,9 +110,10 @@ def render_reference(
     which is what the solver models. Processes may share a file: none undoes what another has done.
     progress is told samples per pixel.
 
-    Raises RadiosityError if the file holds something else.
+    Raises RadiosityError if the file holds something else, or if Mitsuba would trace the scene wrongly.
     """
     model = scene if isinstance(scene, Model) else Model(scene)
+    _require_whole_box(model)
     want = identity(model, sensor, seed)
     width, height = sensor.film().crop_size()
     reference = _kept(path, want) or Reference(want, np.zeros((2, height, width, 3)))
@@ -125,6 +127,18 @@ def render_reference(
         if reference.spp[0] == reference.spp[1]:
             reference = _keep(reference, path)
     return reference
+
+
+def _require_whole_box(model: Model) -> None:
+    """Refuse scenes whose sky and sun shine through walls in `path`, see docs/mitsuba_issues.md."""
+    box, faces = model.scene.bbox(), model.faces
+    slack = 1e-5 * float(np.abs([faces.low, faces.high]).max())
+    whole = (np.array(box.min) <= faces.low + slack).all() and (np.array(box.max) >= faces.high - slack).all()
+    if not whole and any(isinstance(light, Infinite) for light in model.lights.free):
+        raise RadiosityError(
+            "Mitsuba's box of the scene does not hold all of its faces, so 'path' lets the sky shine through walls: "
+            "load the scene with optimize=False"
+        )
 
 
 def _keep(reference: Reference, path: Path) -> Reference:

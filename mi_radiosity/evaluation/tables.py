@@ -6,7 +6,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .records import METRICS, MORE_RAYS, QUESTIONS, Results, Row, cost, interval, select
+from .records import METRICS, MORE_RAYS, QUESTIONS, Results, Row, cost, fell_short, interval, select
+
+SHORT = "†"  # marks oracles that found nothing left to refine before the mesh had the elements wanted
 
 
 class Entry(NamedTuple):
@@ -54,7 +56,8 @@ def report(results: Results, labels: Sequence[str]) -> Report:
         [
             f"Reference of view {view}: {r['spp']} samples per pixel, its own RMSE_a is {r['noise']:.3f}."
             for view, r in results["reference"].items()
-        ],
+        ]
+        + _shortfalls(results["rows"], labels),
         list(_tables(results, present)),
         f"Versions: {', '.join(f'{k} {v}' for k, v in results['versions'].items())}. "
         f"{setting['elements']:,} elements, {setting['rays']:,} rays, {setting['lines']} lines per pair, "
@@ -72,6 +75,22 @@ def markdown(found: Report) -> str:
         lines = [table.head, ["---"] * len(table.head), *rows]
         blocks.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join([*blocks, found.footer]) + "\n"
+
+
+def _shortfalls(rows: Sequence[Row], labels: Sequence[str]) -> list[str]:
+    """A note on oracles whose meshes have fewer elements than were asked for (none or one)."""
+    short = [r for label in labels for r in rows if r["label"] == label and fell_short(r)]
+    found = {r["label"]: f"{r['label']} {r['elements']:,} of {r['elements_wanted']:,}" for r in reversed(short)}
+    if not found:
+        return []
+    return [
+        f"{SHORT} Fewer elements than asked for, because there was nothing left to refine: {', '.join(found.values())}."
+    ]
+
+
+def _marked(rows: Sequence[Row], question: str, label: str) -> str:
+    """The label of an oracle, marked if one of its meshes has fewer elements than were asked for."""
+    return f"{label} {SHORT}" if any(map(fell_short, select(rows, question, label))) else label
 
 
 # ---- Sentences -------------------------------------------------------------------------------------
@@ -93,7 +112,7 @@ def _verdict(results: Results, question: str, labels: Sequence[str]) -> Verdict:
     base = "ks" if "ks" in ranked[1:] else ranked[-1]
     undecided = [other for other in ranked[1:] if not all(_decided(rows, question, best, other, v) for v in views)]
     ratios = " and ".join(
-        " and ".join(f"{mean(best, 'rmse_a_clean', v) / mean(other, 'rmse_a_clean', v):.2f}" for v in views)
+        " and ".join(f"{_ratio(mean(best, 'rmse_a_clean', v), mean(other, 'rmse_a_clean', v)):.2f}" for v in views)
         + f" of {other}'s"
         for other in dict.fromkeys((base, second))
     )
@@ -104,6 +123,11 @@ def _verdict(results: Results, question: str, labels: Sequence[str]) -> Verdict:
         f"for {mean(best, 'oracle_rays') / max(mean(base, 'oracle_rays'), 1):.1f} times the oracle rays "
         f"and {mean(best, 'seconds') / mean(base, 'seconds'):.2f} times the seconds of {base}. " + _doubts(undecided),
     )
+
+
+def _ratio(error: float, other: float) -> float:
+    """One error over another; 1 if neither is more than 0, as in pictures of black scenes."""
+    return error / other if other else 1.0 if error == 0 else math.inf
 
 
 def _doubts(undecided: Sequence[str]) -> str:
@@ -146,7 +170,7 @@ def _errors(rows: Sequence[Row], labels: Sequence[str], question: str, views: Se
     ]
     return Table(
         ["oracle"] + [f"{heading} (view {view})" for view in views for heading in METRICS.values()],
-        [[Entry(label), *entries] for label, *entries in zip(labels, *columns, strict=True)],
+        [[Entry(_marked(rows, question, label)), *entries] for label, *entries in zip(labels, *columns, strict=True)],
         f"Given {QUESTIONS[question]}",
     )
 
@@ -165,7 +189,8 @@ def _costs(rows: Sequence[Row], labels: Sequence[str], question: str) -> Table:
     def line(label):
         own = select(rows, question, label)
         counts = [_mean(own, name) for name in names] + [statistics.mean(cost(r, "rays") for r in own)]
-        return [label, *(f"{count:,.0f}" for count in counts), f"{_mean(own, 'seconds'):.2f}"]
+        mark = _marked(rows, question, label)
+        return [mark, *(f"{count:,.0f}" for count in counts), f"{_mean(own, 'seconds'):.2f}"]
 
     return Table(
         ["oracle", *(name.replace("_", " ") for name in names), "rays in all", "seconds"],
@@ -177,7 +202,10 @@ def _split(rows: Sequence[Row], labels: Sequence[str], views: Sequence[int]) -> 
     parts = ("RMSE_a", "of the mesh", "of the rays")
     return Table(
         ["oracle"] + [f"{name} (view {view})" for view in views for name in parts],
-        [[Entry(label), *(Entry(f"{x:.3f}") for v in views for x in split(rows, label, v))] for label in labels],
+        [
+            [Entry(_marked(rows, "noise", label))] + [Entry(f"{x:.3f}") for v in views for x in split(rows, label, v)]
+            for label in labels
+        ],
         "Where the error comes from",
         "RMSE_a² with the noise of the reference removed, split by rendering the same meshes with "
         f"{MORE_RAYS} times the power rays.",

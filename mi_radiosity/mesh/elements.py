@@ -9,7 +9,7 @@ import numpy as np
 from ..core.arrays import concat, opaque_index, owned, owned_vectors, totals
 from ..core.points import hash_pair, triangle
 from ..scene.lights import Lights
-from ..scene.materials import Materials
+from ..scene.materials import WHITEST, Materials
 from ..scene.patches import Patches
 from .crown import Crown
 from .subdivision import child_at, child_frame, child_point
@@ -290,32 +290,19 @@ class Tree(Elements):
         }
 
     def _color(self):
-        """Give new elements the ρ of their part of textures, all in one go."""
+        """Give new elements the ρ of their part of textures, all in one go. The others have that of their patch."""
         count = len(self) - self._colored
         if count:
             new = opaque_index(self._colored) + dr.arange(mi.UInt32, count)
-            frame = (dr.gather(type(x), x, new) for x in (self.patch, self.u0, self.v0, self.scale))
-            dr.scatter(self.reflectance, self._mean_reflectance(*frame), new)
+            face = dr.gather(mi.UInt32, self.patches.face, dr.gather(mi.UInt32, self.patch, new))
+            new = dr.gather(mi.UInt32, new, dr.compress(dr.gather(mi.UInt32, self._materials.varies, face) != 0))
+        if count and dr.width(new):
+            patch, *frame = (dr.gather(type(x), x, new) for x in (self.patch, self.u0, self.v0, self.scale))
+            face, back = dr.gather(mi.UInt32, self.patches.face, patch), dr.gather(mi.Bool, self.patches.back, patch)
+            rho = self._materials.mean_reflectance(face, back, *frame)
+            dr.scatter(self.reflectance, dr.minimum(rho, WHITEST), new)
             dr.eval(self.reflectance)
         self._colored = len(self)
-
-    def _mean_reflectance(self, patch, u0, v0, scale):
-        """ρ averaged over four points of each element (Color3f)."""
-        face, back = dr.gather(mi.UInt32, self.patches.face, patch), dr.gather(mi.Bool, self.patches.back, patch)
-        # Where other lobes are traced, ρ is one number per patch.
-        result = dr.gather(mi.Color3f, self.patches.reflectance, patch)
-        plain = dr.compress(~self._materials.is_traced(face) & dr.full(mi.Bool, True, dr.width(face)))
-        if dr.width(plain) == 0:
-            return result
-        k = dr.arange(mi.UInt32, 4 * dr.width(plain))
-        face, back, u0, v0, scale = (
-            dr.gather(type(x), x, dr.gather(mi.UInt32, plain, k // 4)) for x in (face, back, u0, v0, scale)
-        )
-        a, b = (dr.select(k % 4 == which, 2 / 3, dr.select(k % 4 == 3, 1 / 3, 1 / 6)) for which in (1, 2))
-        rho = self._materials.reflectance_at(face, u0 + scale * a, v0 + scale * b, back)
-        dr.eval(rho)
-        dr.scatter(result, mi.Color3f(*(dr.block_sum(c, 4) / 4 for c in rho)), plain)
-        return result
 
 
 def mean_exitance(

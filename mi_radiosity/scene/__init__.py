@@ -2,8 +2,9 @@
 
 from .lights import LIGHTS, Light
 from .materials import Finding, inspect
+from .meshes import build_mesh
 from .model import Model
 from .state import refuse_gradients
-from .tessellate import MESHERS, build_mesh, mesher
+from .tessellate import MESHERS, mesher
 
 __all__ = ["LIGHTS", "MESHERS", "Finding", "Light", "Model", "build_mesh", "inspect", "mesher", "refuse_gradients"]

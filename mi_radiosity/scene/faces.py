@@ -43,7 +43,10 @@ class Faces:
         self.warnings: list[str] = []
         if not scene.shapes():
             raise RadiosityError("the scene has no shapes: nothing can be lit")
-        self.tracing, self.parts = tracing_scene(scene)
+        self.tracing, self.parts, mended = tracing_scene(scene)
+        if mended:
+            where = ", ".join(mended[:3]) + (f" and {len(mended) - 3} more" if len(mended) > 3 else "")
+            self.warnings.append(f"{where}: vertex normals that are zero or no numbers are replaced by face normals")
         self.smooth = any(mesh.has_vertex_normals() for mesh in self.tracing.shapes())
         self._read(*_corners(self.tracing))
         self._orient()

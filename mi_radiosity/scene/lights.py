@@ -12,12 +12,12 @@ import numpy as np
 from ..core.arrays import opaque_index, owned, owned_vectors, totals
 from ..core.errors import RadiosityError
 from ..core.plugins import Registry
-from ..core.points import kronecker, triangle
+from ..core.points import kronecker
+from .averages import Averages
 from .faces import Faces
 from .state import Parameters
 
 LIGHTS = Registry("emitter")
-LATTICE = 144, 89  # points of a face or an element that a textured radiance is averaged over; Fibonacci numbers
 SAMPLES = 1 << 18  # rays that a lamp's power is averaged over
 GLANCES = 1 << 12  # directions in which a sky is looked at for a sun
 SHARP = 300 / (4 * np.pi)  # density over directions, 1/sr, of parts of a sky that are as small and bright as a sun
@@ -70,8 +70,9 @@ class Light:
         raise NotImplementedError
 
     def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
-        """Towards the lamp from points, with two uniform numbers each: unit direction, distance, and the irradiance
-        of an unblocked surface that faces that way, over the density of the sample (Vector3f, Float, Color3f [n])."""
+        """Towards the lamp from points, with two uniform numbers each: unit direction, distance (infinite for emitters
+        at infinity), and the irradiance of an unblocked surface that faces that way, over the density of the sample
+        (Vector3f, Float, Color3f [n])."""
         raise NotImplementedError
 
     def fingerprint(self) -> bytes:
@@ -118,7 +119,7 @@ class Light:
         if only_sharp:
             lit &= sharp
         start = x + normal * rays.patches.lift
-        hidden = rays.blocked(start, start + direction * distance, lit)
+        hidden = rays.blocked_along(start, direction, distance, lit)
         found = dr.select(lit & ~hidden, irradiance * cosine, 0)
         return found * (1 - self.share_of_rays(direction, cosine, rays_per_line)), found, sharp
 
@@ -189,6 +190,12 @@ class Infinite(Free):
         "SunskyEmitter",
         "TimedSunskyEmitter",
     )
+
+    def sample(self, point: "mi.Point3f", s: "mi.Float", t: "mi.Float") -> "tuple[mi.Vector3f, mi.Float, mi.Color3f]":
+        """The distance is infinite. Mitsuba's own distance ends at a bounding sphere, and Mitsuba 3.9.1 makes that
+        sphere too small in scenes whose rectangles it has merged (docs/mitsuba_issues.md)."""
+        direction, _, irradiance = super().sample(point, s, t)
+        return direction, dr.full(mi.Float, dr.inf, dr.width(point)), irradiance
 
     @cached_property
     def may_be_sharp(self) -> bool:
@@ -266,7 +273,8 @@ class Lights:
     """The lamps of a scene: ``exitance`` of its faces, the mean of each, W/m² [faces, 3], and the ``free`` ones that
     are no surfaces; ``textured``: does the exitance vary over a face?
 
-    Raises RadiosityError if there is no light where it is ``required``, or if a lamp's is impossible, naming the shape.
+    Raises RadiosityError if there is no emitter where one is ``required``, or if the light of one is impossible, naming
+    the shape.
     """
 
     def __init__(self, faces: Faces, required: bool = True) -> None:
@@ -276,15 +284,15 @@ class Lights:
         kinds = [None if emitter is None else LIGHTS.find(emitter.class_name()) for emitter in emitters]
         self._kinds = list(dict.fromkeys(kind for kind in kinds if kind and kind.on_surface))
         lamps = [kind in self._kinds for kind in kinds]
-        self.textured = any(varies(emitter) for emitter, lamp in zip(emitters, lamps) if lamp)
+        textured = np.array([lamp and varies(emitter) for emitter, lamp in zip(emitters, lamps)], dtype=bool)
+        self.textured, self._averages = bool(textured.any()), Averages(faces, textured[faces.shape])
         if self._kinds:
             self._emitters = mi.EmitterPtr([e if lamp else None for e, lamp in zip(emitters, lamps)])
             self._kind = owned(mi.UInt32, [self._kinds.index(kind) if kind in self._kinds else 0 for kind in kinds])
             self._shape = owned(mi.UInt32, faces.shape)
         self.exitance = self._of_faces(np.flatnonzero(np.array(lamps)[faces.shape]))
         self.free = self._free()
-        lit = (self.exitance * faces.area[:, None]).any() or any(any(light.power()) for light in self.free)
-        if required and not lit:
+        if required and not self._kinds and not self.free:
             raise RadiosityError("the scene has no light: add a lamp, such as an 'area' emitter of a shape")
 
     def _of_faces(self, lamps):
@@ -332,14 +340,12 @@ class Lights:
         return total
 
     def mean_exitance(self, face: "mi.UInt32", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float") -> "mi.Color3f":
-        """E averaged over triangles (u0 + scale a, v0 + scale b) of faces' fronts (Color3f [n])."""
-        points, step = LATTICE if self.textured else (1, 0)
-        each, k = opaque_index(points), dr.arange(mi.UInt32, dr.width(face) * points)
-        face, u0, v0, scale = (dr.gather(type(x), x, k // each) for x in (face, u0, v0, scale))
-        number = k % each
-        a, b = triangle(*((mi.Float(x % each) + 0.5) / mi.Float(each) for x in (number, number * step)))
-        values = self.exitance_at(face, u0 + scale * a, v0 + scale * b)
-        return mi.Color3f(*(dr.block_sum(x + dr.zeros(mi.Float, dr.width(k)), points) / mi.Float(each) for x in values))
+        """E averaged over triangles (u0 + scale a, v0 + scale b) of faces' fronts (see `Averages`; Color3f [n])."""
+
+        def value(face, u, v, back):
+            return self.exitance_at(face, u, v)
+
+        return self._averages.mean(value, face, dr.full(mi.Bool, False, dr.width(face)), u0, v0, scale)
 
     def at(
         self, patches: Any, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", active: "mi.Bool | bool" = True
@@ -359,6 +365,12 @@ class Lights:
         si.wi = -direction
         seen = dr.select(active, mi.Color3f(self.sky_light.emitter.eval(si, active)), 0)
         return dr.pi * seen * self.sky_light.color
+
+    @property
+    def any_power(self) -> bool:
+        """Does any emitter have power?"""
+        on_surfaces = (self.exitance * self._faces.area[:, None]).any()
+        return bool(on_surfaces) or any(any(light.power()) for light in self.free)
 
     @property
     def may_be_sharp(self) -> bool:

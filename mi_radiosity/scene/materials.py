@@ -9,7 +9,8 @@ import numpy as np
 
 from ..core.arrays import opaque_index, owned
 from ..core.errors import RadiosityError
-from ..core.points import Stream, kronecker, stream_seed, triangle
+from ..core.points import Stream, kronecker, permuted, stream_seed, triangle
+from .averages import Averages
 from .faces import Faces
 from .lights import LIGHTS
 from .tessellate import UNMESHED, Part, children, parts
@@ -21,17 +22,18 @@ GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 FRAMES = {"NormalMap", "BumpMap"}
 BENT = 2
 WHITEST, ROUNDING = 0.999, 1e-4
-POINTS = 16  # of a textured face, that its mean is taken over
 SOLID_SAMPLES = 1 << 15  # for the albedo of a shape
-FACE_SAMPLES, LEAST = 1 << 8, 1 << 6  # of a face of a textured one, and if there are many
-MANY = 1 << 20  # samples of all such faces
+LEAST = 1 << 6  # samples of a face of a textured shape, if there are many; SOLID_SAMPLES if there are few
+MANY = 1 << 20  # samples of all such faces: bounds the work
 AT_ONCE = 1 << 22  # samples in one launch
 
 
 class Materials:
     """What the faces are made of: ``rho`` [2 sides, faces, 3], the albedo of the diffuse lobe, ``two_sided`` [faces],
-    ``textured`` (is any of them?), and which shapes have other lobes, which are ``traced`` [shapes]. ``bsdfs``
-    [shapes]: Mitsuba's. ``bent`` [faces]: shading normals, of vertices or of a map, are far from the geometric one.
+    ``varies`` (UInt32 [faces]: 1 where ρ of a diffuse BSDF is textured), ``textured`` (does any vary?), and which
+    shapes have other lobes, which are ``traced`` [shapes]. ``bsdfs`` [shapes]: Mitsuba's. ``bent`` [faces]: shading
+    normals, of vertices or of a map, are far from the geometric one. ``mixed``: some surfaces have a diffuse lobe and
+    others.
 
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
@@ -52,9 +54,15 @@ class Materials:
         self.all_plain = not (self.traced.any() or self.bent.any())
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))
-        plain = ~self.traced[faces.shape]
-        if plain.any():
-            self.rho[:, plain] = self._mean(np.flatnonzero(plain), POINTS if self.textured else 1)
+        plain = np.flatnonzero(~self.traced[faces.shape])
+        varies = (textured & ~self.traced)[faces.shape]
+        self._averages, self.varies = Averages(faces, varies), owned(mi.UInt32, varies)
+        if len(plain):
+            face, n = owned(mi.UInt32, plain), len(plain)
+            zero, one = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n)
+            for rho, back in zip(self.rho, (False, True)):
+                mean = self.mean_reflectance(face, dr.full(mi.Bool, back, n), zero, zero, one)
+                rho[plain] = np.array(mean, dtype=np.float64).reshape(3, n).T
         self._find_albedos(textured)
         faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
@@ -74,25 +82,12 @@ class Materials:
         self.mixed = bool((self.bent | (self.traced[faces.shape] & self.rho.any(axis=(0, 2)))).any())
         faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
 
-    def _mean(self, faces, points):
-        """ρ averaged over points of diffuse faces [2 sides, faces, 3]."""
-        n, third = len(faces), mi.Float(1 / 3)
-        face = owned(mi.UInt32, faces)
-
-        def step(k, front, back):
-            at = (k + 0.5) / points, ((k * 7) % opaque_index(points) + 0.5) / points
-            u, v = (third, third) if points == 1 else triangle(*(mi.Float(x) for x in at))
-            si = self._faces.surface(face, u + dr.zeros(mi.Float, n), v)
-            sides = []
-            for total, z in ((front, 1.0), (back, -1.0)):
-                si.wi = mi.Vector3f(0, 0, z)
-                sides.append(total + mi.Color3f(si.bsdf().eval_diffuse_reflectance(si)))
-            return k + 1, *sides
-
-        state = dr.zeros(mi.UInt32, n), dr.zeros(mi.Color3f, n), dr.zeros(mi.Color3f, n)
-        _, *totals = dr.while_loop(state, lambda k, *_: k < points, step)
-        dr.eval(totals)
-        return np.array([np.array(total, dtype=np.float64).reshape(3, n).T / points for total in totals])
+    def mean_reflectance(
+        self, face: "mi.UInt32", back: "mi.Bool", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
+    ) -> "mi.Color3f":
+        """ρ averaged over triangles (u0 + scale a, v0 + scale b) of diffuse faces, on the back side where ``back``
+        (see `Averages`). Returns Color3f [n]."""
+        return self._averages.mean(self.reflectance_at, face, back, u0, v0, scale)
 
     def is_traced(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Are faces not plainly diffuse, so that paths evaluate their BSDF (Bool [n])?"""
@@ -116,7 +111,7 @@ class Materials:
         first = np.searchsorted(shape, np.arange(len(self.traced)))
         solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
         various = np.flatnonzero((self.traced & textured)[shape])
-        each = max(LEAST, min(FACE_SAMPLES, MANY // max(len(various), 1)))
+        each = max(LEAST, min(SOLID_SAMPLES, MANY // max(len(various), 1)))
         for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, each, False)):
             for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
                 for rho, side in zip(self._albedos(part, samples), self.rho):
@@ -142,7 +137,10 @@ class Materials:
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
         key = owned(mi.UInt32, self._faces.rank[faces])  # not Mitsuba's number of the face, which varies
-        x, y, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
+        _, _, s, t = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO)), k // each)
+        # Points in an order of their own: in the order of directions and lobes, a lobe would see some places only.
+        at = permuted(k % each, each, opaque_index(stream_seed(0, Stream.ALBEDO, 2)))
+        x, y, _, _ = kronecker(at, key, opaque_index(stream_seed(0, Stream.ALBEDO, 3)), k // each)
         a, b, c, _ = kronecker(k % each, key, opaque_index(stream_seed(0, Stream.ALBEDO, 1)), k // each)
         si = self._faces.surface(face, *triangle(x, y))
         wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))

@@ -23,10 +23,10 @@ from .state import Parameters, State
 class Model:
     """A Mitsuba scene read once: ``faces``, ``materials``, ``lights``, ``patches`` and the ``rays`` between them.
 
-    sides: patches to make (see `Patches`); by default those that light can reach, or all of them if the scene need
-    not be ``lit``, and may have no lamp. ``warnings``: what a user should know (list of str). ``unreached``: how many
-    sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance, lobes, emission and lamps.
-    ``state``: what the scene was like when it was read.
+    sides: patches to make (see `Patches`). By default those that light can reach; all of them if light reaches none, or
+    if the scene need not be ``lit``, and may have no emitter. ``warnings``: what a user should know (list of str).
+    ``unreached``: how many sides no light reaches. ``fingerprint``: SHA-256 of geometry, orientation, reflectance,
+    lobes, emission and lamps. ``state``: what the scene was like when it was read.
 
     Raises RadiosityError for whatever is not modelled, naming the shape.
     """
@@ -43,11 +43,17 @@ class Model:
         self.unreached = 0
         wanted = self._sides(self._candidate & ~overlaps.covered) if sides is None else sides
         patches = make_patches(self.faces, self.materials, self.lights, _some(wanted))
-        if sides is None and lit:
+        found = np.ones(patches.count, dtype=bool)
+        if lit and not self.lights.any_power:
+            self.faces.warnings.append("no emitter has any power: the solution is black")
+        elif lit and sides is None:
             found = reached(self._rays(patches, overlaps), self.lights)
+            if not found.any():
+                self.faces.warnings.append("no light reaches any surface with a diffuse lobe: the solution is black")
+                found[:] = True
+        if not found.all():
             self.unreached = int((~found).sum())
-            if self.unreached:
-                patches = patches.only(_some(np.flatnonzero(found)))
+            patches = patches.only(np.flatnonzero(found))
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
         self.rays = self._rays(patches, kept)
@@ -127,6 +133,4 @@ def _some(sides):
     """Sides to make patches of: there must be any."""
     if len(sides):
         return sides
-    raise RadiosityError(
-        "light meets no surface with a diffuse lobe, so there is nothing to solve: add one, or use 'path'"
-    )
+    raise RadiosityError("no surface has a diffuse lobe, so there is nothing to solve: add one, or use 'path'")

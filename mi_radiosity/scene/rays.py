@@ -137,9 +137,22 @@ class Rays:
 
     def blocked(self, a: "mi.Point3f", b: "mi.Point3f", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Does anything lie between points a and b, relative to the origin of the patches (Bool [n])?"""
+        return self.scene.ray_test(self._between(a, b), active=active)
+
+    def blocked_along(
+        self, a: "mi.Point3f", direction: "mi.Vector3f", distance: "mi.Float", active: "mi.Bool | bool" = True
+    ) -> "mi.Bool":
+        """Does a shadow ray hit anything that starts at points a, relative to the origin of the patches, and runs a
+        distance along unit directions (Bool [n])? An infinite distance sets no bound."""
+        near = self._between(a, a + direction * distance)
+        far = mi.Ray3f(a + self.patches.origin, direction)
+        return self.scene.ray_test(dr.select(dr.isfinite(distance), near, far), active=active)
+
+    def _between(self, a, b):
+        """Rays from points a that end just before points b (Ray3f [n])."""
         ray = mi.Ray3f(a + self.patches.origin, b - a)
         ray.maxt = 1 - 1e-5
-        return self.scene.ray_test(ray, active=active)
+        return ray
 
     def kernel(
         self, i: "mi.UInt32", ui: "mi.Float", vi: "mi.Float", j: "mi.UInt32", uj: "mi.Float", vj: "mi.Float"

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby, product
 from typing import Any
 
 import drjit as dr
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..core.arrays import owned_vectors
 from ..core.plugins import Registry
+from .meshes import build_mesh, placed, repaired, unit
 
 FEWEST, MOST = 12, 72  # segments around a shape
 OUTLINE = 1 / 2000  # of the size of the scene: by how much a silhouette may miss
@@ -106,24 +108,49 @@ def children(thing: "mi.Object") -> list:
     return list(callback.found)
 
 
-def tracing_scene(scene: "mi.Scene") -> "tuple[mi.Scene, list[Part]]":
-    """The scene itself, or one in which every shape is a mesh, and its parts in Mitsuba's order."""
+def tracing_scene(scene: "mi.Scene") -> "tuple[mi.Scene, list[Part], list[str]]":
+    """The scene itself, or one in which every shape is a mesh whose normals have a direction; its parts in Mitsuba's
+    order; and the names of those whose normals were replaced."""
     found = parts(scene)
-    if all(part.to_world is None and isinstance(part.shape, mi.Mesh) for part in found):
-        return scene, found
-    box = scene.bbox()
-    size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    meshes, names = [as_mesh(part, size) for part in found], [part.shape.id() for part in found]
+    sound = {part.shape.ptr: repaired(part.shape) for part in found if isinstance(part.shape, mi.Mesh)}
+    mended = [part.name for part in found if sound.get(part.shape.ptr) is not None]
+    if not mended and all(part.to_world is None and isinstance(part.shape, mi.Mesh) for part in found):
+        return scene, found, mended
+    size = _size(found)
+    meshes = [as_mesh(part, size, sound.get(part.shape.ptr) or part.shape) for part in found]
+    names = [part.shape.id() for part in found]
     tracing = mi.load_dict({"type": "scene"} | {f"shape_{i}": mesh for i, mesh in enumerate(meshes)}, optimize=False)
     for part, name in zip(found, names):
         part.shape.set_id(name)  # load_dict has given those that are in both scenes another
     by_pointer = {mesh.ptr: part for mesh, part in zip(meshes, found)}
-    return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()]
+    return tracing, [by_pointer[shape.ptr] for shape in tracing.shapes()], mended
 
 
-def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":
-    """The mesh of a part where it stands: its shape, if that is one."""
-    shape = part.shape
+def _size(found):
+    """Length of the diagonal of the box around parts, m. Mitsuba's own boxes are wrong for meshes that Mitsuba 3.9.1
+    has merged (docs/mitsuba_issues.md), so the box of a mesh is that of its vertices."""
+    boxes = []
+    for _, members in groupby(found, key=lambda part: part.number):
+        first, *others = members
+        corners = np.concatenate([_points(part.shape) for part in (first, *others)])
+        if first.to_world is not None and len(corners):  # as Mitsuba bounds an instance: by its group's box
+            corners = np.array(list(product(*zip(corners.min(axis=0), corners.max(axis=0)))))
+            corners = corners @ first.to_world[:3, :3].T + first.to_world[:3, 3]
+        boxes.append(corners)
+    corners = np.concatenate(boxes)
+    return float(np.linalg.norm(np.ptp(corners, axis=0))) if len(corners) else 0.0
+
+
+def _points(shape):
+    """The finite vertices of a mesh, or two corners of the box around another shape (float64 [n, 3])."""
+    if isinstance(shape, mi.Mesh):
+        vertices = np.array(shape.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        return vertices[np.isfinite(vertices).all(axis=1)]
+    return np.array([shape.bbox().min, shape.bbox().max], dtype=np.float64).reshape(2, 3)
+
+
+def as_mesh(part: Part, scene_size: float, shape: "mi.Shape") -> "mi.Mesh":
+    """The mesh of a part where it stands: ``shape``, its own or a copy with other normals, if that is a mesh."""
     if not isinstance(shape, mi.Mesh):
         box = shape.bbox()
         extent = np.linalg.norm(np.array(box.max) - np.array(box.min))
@@ -131,74 +158,6 @@ def as_mesh(part: Part, scene_size: float) -> "mi.Mesh":
             extent *= np.linalg.norm(part.to_world[:3, :3], 2)  # the direction that the instance stretches most
         shape = MESHERS.find(shape.class_name())(shape, min(float(extent) / max(scene_size, 1e-30), 1.0))
     return shape if part.to_world is None else placed(shape, part.to_world)
-
-
-# ---- Making meshes ---------------------------------------------------------------------------------
-
-
-def build_mesh(
-    shape: "mi.Shape",
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    normals: np.ndarray | None = None,
-    uv: np.ndarray | None = None,
-    flipped: bool = False,
-) -> "mi.Mesh":
-    """An ``mi.Mesh`` from vertices [n, 3] and faces [m, 3], with the BSDF of ``shape``; with normals [n, 3] and texture
-    coordinates [n, 2] of the vertices, where they are given. ``flipped``: its front is where the normals point away."""
-    properties = mi.Properties()
-    properties["mesh_bsdf"] = shape.bsdf()
-    properties["flip_normals"] = flipped
-    given = {"has_vertex_normals": normals is not None, "has_vertex_texcoords": uv is not None}
-    mesh = mi.Mesh(shape.id(), len(vertices), len(faces), props=properties, **given)
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = _flat(mi.Float, vertices)
-    params["faces"] = _flat(mi.UInt32, faces)
-    if uv is not None:
-        params["vertex_texcoords"] = _flat(mi.Float, uv)
-    params.update()
-    if normals is not None:  # new positions make Mitsuba find normals of its own
-        params["vertex_normals"] = _flat(mi.Float, normals)
-        params.update()
-    dr.eval(params["vertex_positions"])
-    return mesh
-
-
-def _flat(kind, array):
-    return kind(np.ascontiguousarray(array, dtype=np.float32 if kind is mi.Float else np.uint32).ravel())
-
-
-def placed(mesh: "mi.Mesh", to_world: np.ndarray) -> "mi.Mesh":
-    """A copy of a mesh under a transform [4, 4]."""
-
-    def rows(array, width):
-        return np.array(array, dtype=np.float64).reshape(-1, width)
-
-    linear, faces = to_world[:3, :3], rows(mesh.faces_buffer(), 3)
-    vertices = rows(mesh.vertex_positions_buffer(), 3) @ linear.T + to_world[:3, 3]
-    normals = uv = None
-    if mesh.has_vertex_normals() and not mesh.has_face_normals():
-        normals = _unit(rows(mesh.vertex_normals_buffer(), 3) @ np.linalg.inv(linear))
-    if mesh.has_vertex_texcoords():
-        uv = rows(mesh.vertex_texcoords_buffer(), 2)
-    if np.linalg.det(linear) < 0:
-        faces = faces[:, ::-1]  # normals do not turn round in a mirror
-    copy = build_mesh(mesh, vertices, faces, normals, uv, mesh.has_flipped_normals())
-    for name in _attributes(mesh):
-        values = np.array(mesh.attribute_buffer(name))
-        rows_of = len(faces) if name.startswith("face_") else len(vertices)
-        copy.add_attribute(name, len(values) // rows_of, values)
-    return copy
-
-
-def _attributes(mesh):
-    """Names of a mesh's own attributes, such as colours of its vertices."""
-    known = {"vertex_positions", "vertex_normals", "vertex_texcoords", "faces"}
-    return [name for name in mi.traverse(mesh).keys() - known if name.startswith(("vertex_", "face_"))]
-
-
-def _unit(vectors):
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1), 1e-30)[:, None]
 
 
 # ---- Meshers ---------------------------------------------------------------------------------------
@@ -218,7 +177,7 @@ def _in_world(shape, linear, vertices, faces, uv, normals=None):
     decides which side is the front, because ``flip_normals`` and mirrored transforms combine differently per shape.
     """
     vertices = vertices @ linear.T + transform_of(shape)[:3, 3]
-    up = _unit((normals if normals is not None else np.array([[0.0, 0.0, 1.0]])) @ np.linalg.inv(linear))
+    up = unit((normals if normals is not None else np.array([[0.0, 0.0, 1.0]])) @ np.linalg.inv(linear))
     every = np.broadcast_to(up, vertices.shape)
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

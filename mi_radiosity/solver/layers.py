@@ -178,6 +178,8 @@ def _one_by_one(count):
 
 def _shares(lamps, rays):
     """Whole numbers of rays for the lamps that add up to ``rays``, in proportion to their power (list)."""
+    if len(lamps) == 0:
+        raise RadiosityError("layers keep the light of emitters, and none has any power: leave out layers")
     enough = LEAST_RAYS * len(lamps)
     if rays < enough:
         raise RadiosityError(

@@ -9,9 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NONE, concat, opaque_index, owned_vectors
-from ..core.errors import RadiosityError
 from ..core.points import Stream, stream_seed
-from ..mesh import Clusters, Exposure, Pairs, Tree
+from ..mesh import MAX_LEVEL, Clusters, Exposure, Pairs, Tree
 from ..scene import Model
 from ..transport import Problem, Transport
 from ..transport.problem import Record
@@ -23,6 +22,7 @@ RENEW = 4  # pilot rays are cast anew when the mesh has grown by this factor
 PILOT_RAYS = 24  # per leaf, at least
 LEAST_PILOT = 1 << 16
 MOST_PILOT = 1 << 20
+MAX_ADDED = 1 << 20  # elements that an ε may add to the patches: bounds memory, of which an element takes some 4 kB
 
 
 class Refinement:
@@ -33,8 +33,9 @@ class Refinement:
     oracle weighs them with; none of them carries power into the solution.
 
     tree, pairs: what grows. pilot: the Transport that casts pilot rays. elements: leaves wanted, or None; epsilon: ε,
-    or None; just one of them is given. A mesh the oracle finds too little to refine in is an error if ``exact``.
-    Afterwards ``epsilon`` is the ε reached, ``rays`` the pilot rays cast, ``first_share`` the lamps' part of the power.
+    or None; just one of them is given. Afterwards ``epsilon`` is the ε reached, ``rays`` the pilot rays cast,
+    ``first_share`` the lamps' part of the power, and ``shortfall`` the reason why the mesh has fewer elements than
+    wanted, or why pairs worse than ε are left; None if neither is so.
     """
 
     def __init__(
@@ -47,10 +48,11 @@ class Refinement:
         epsilon: float | None,
         seed: int,
         progress: Callable[[int], None] = lambda done: None,
-        exact: bool = True,
     ) -> None:
         self._model, self._tree, self._pairs, self._pilot = model, tree, pairs, pilot
-        self._wanted, self._least, self._exact = elements, epsilon or 0.0, exact
+        self._least = epsilon or 0.0
+        self._most = tree.leaf_count + MAX_ADDED if elements is None else elements
+        self.shortfall: str | None = None
         self._seed, self._progress = seed, progress
         self.epsilon, self._level = epsilon or 0.0, math.inf
         self.rays, self._pilots, self.first_share = 0, 0, 0.5
@@ -65,15 +67,30 @@ class Refinement:
                 break
             if not self._until_pilot() and self._room():
                 self._cast_pilot()
-        if self._wanted is not None and self._room() and self._exact:
-            raise RadiosityError(
-                f"the oracle '{self._pairs.oracle}' finds nothing left to refine at {self._tree.leaf_count} elements: "
-                f"ask for fewer elements than {self._wanted}, or give epsilon instead"
-            )
+        self.shortfall = self._find_shortfall()
+
+    def _find_shortfall(self):
+        """See ``shortfall``."""
+        pairs, value, element = self._candidates()
+        worse = mi.UInt32()
+        if dr.width(pairs):
+            worse = dr.compress((value > 0) & (value >= dr.opaque(mi.Float, self._least)))
+        too_deep = dr.width(worse) and dr.any(dr.gather(mi.UInt32, element, worse) == NONE)
+        if self._room() and self._least and not too_deep:
+            return None  # all pairs are better than ε
+        if self._room() and too_deep:
+            return f"elements are split {MAX_LEVEL} times at most"
+        if self._room() and dr.width(worse):
+            return "the clusters that are left to split have more parts than the mesh has room for"
+        if self._room():
+            return f"the oracle '{self._pairs.oracle}' finds nothing left to refine"
+        if self._least and dr.width(worse):
+            return f"an epsilon adds {MAX_ADDED:,} elements at most"
+        return None
 
     def _room(self):
         """How many more elements may split."""
-        return 1 << 30 if self._wanted is None else (self._wanted - self._tree.leaf_count) // 3
+        return max((self._most - self._tree.leaf_count) // 3, 0)
 
     def _until_pilot(self):
         """How many more elements may split before pilot rays are cast anew, at the same size of every mesh."""
@@ -125,19 +142,20 @@ class Refinement:
         pairs, value, element = self._candidates()
         if dr.width(pairs) == 0:
             return 0
+        value = dr.select(element == NONE, 0, value)
+        dr.eval(value)
         room = min(self._room(), self._until_pilot())
         split = self._split_elements(value, element, room) if room else 0
         return split + self._split_pairs(pairs, value, element)
 
     def _candidates(self):
-        """Pairs that could be split: their numbers, the oracle's value, and which element would split."""
+        """Pairs without children: their numbers, the oracle's value, and which element would split (NONE: none can)."""
         pairs = self._pairs
         chosen = dr.compress((pairs.child == 0) & pairs.asked)
         if dr.width(chosen) == 0 or not pairs.sigma:
             return mi.UInt32(), mi.Float(), mi.UInt32()
         value = pairs.value(chosen, self._radiosity)
         element = pairs.larger(chosen)
-        value = dr.select(element == NONE, 0, value)
         dr.eval(value, element)
         return chosen, value, element
 
@@ -196,6 +214,8 @@ class Refinement:
 
 def _joined(records):
     """One Record of all rays that left a patch and met one."""
+    if not records:  # no emitter has any power
+        return Record(*(kind() for kind in (mi.UInt32, mi.Float, mi.Float) * 2), mi.UInt32())
     kept = [dr.compress((r.i != NONE) & (r.j != NONE)) for r in records]
 
     def join(name):

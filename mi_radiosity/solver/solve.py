@@ -10,7 +10,6 @@ import numpy as np
 from ..core.errors import RadiosityError, interruptible
 from ..core.points import Stream, stream_seed
 from ..mesh import Clusters, Exposure, Pairs, Tree, cluster_labels, crossed_leaves
-from ..mesh.clusters import count_of
 from ..oracles import GMI, Oracle
 from ..scene import Model
 from ..scene.lamps import Lamps
@@ -40,10 +39,11 @@ def solve(
     """Solve the diffuse light transport of a scene, B_i = E_i + ρ_i Σ_j F_ij B_j (eq. 1).
 
     scene: mi.Scene (or a Model of one). oracle: an Oracle, GMI(0.5) by default.
-    elements: elements wanted, reached to within 3, or less where patches share and the oracle finds nothing left to
-    split; or epsilon: the ε of the oracle. Without either, 19,000 more than the scene has patches, but 114,000 at most,
-    unless the oracle finds less to refine. Where there are to be fewer elements than patches, or hardly more, if there
-    are many (by default if more than 95,000), clusters of patches are elements (`Crown`): they share one irradiance and
+    elements: elements wanted, reached to within 3. The mesh has fewer if the oracle finds nothing left to split, and
+    more if clusters of patches cannot be as large as that; a warning says so. epsilon: the ε of the oracle, instead of
+    elements. Without either the mesh has 19,000 elements more than the scene has patches, but 114,000 at most, unless
+    the oracle finds less to refine. Where there are to be fewer elements than patches, or hardly more, if there are
+    many (by default if more than 95,000), clusters of patches are elements (`Crown`): they share one irradiance and
     one set of pairs, and the oracle splits them. rays: rays that carry the power and gather it, used exactly; by
     default 300 for each of the first 19,000 elements, and 20 for each of all, as light, not tessellation, decides what
     is needed; twice as many where lamps cast sharp shadows and are no surfaces. lines: random lines S per pair for the
@@ -54,8 +54,9 @@ def solve(
     all; from then on more of them would go into pictures with more profit (see `afford`). progress: called with
     (stage, done, total), stage being "refine" or "distribute" (total is None where it is not known).
 
-    Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements. Raises RadiosityError for
-    options and scenes that cannot be used.
+    Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements, and if the mesh has another
+    number of elements than was asked for. The solution of a scene that no light reaches is black. Raises RadiosityError
+    for options and scenes that cannot be used.
     """
     oracle, transport = oracle or GMI(0.5), transport or Gathering()
     _check(oracle, elements, epsilon, rays, lines, seconds)
@@ -63,12 +64,12 @@ def solve(
 
     model = scene if isinstance(scene, Model) else Model(scene)
     clock.lap("scene")
-    given, fixed = elements is not None, rays is not None
+    asked, fixed = elements, rays is not None
     if seconds is not None:
         elements, rays, pace = afford(model, seconds - clock.total(), elements, rays)
     wanted, shared = plan(model, elements, epsilon)
 
-    tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared, given))
+    tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared))
     pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
     refinement = Refinement(
         model,
@@ -79,7 +80,6 @@ def solve(
         epsilon,
         seed,
         lambda done: report("refine", done, wanted),
-        given and shared is None,
     )
     refinement.run()
     mesh = tree.freeze()
@@ -113,6 +113,7 @@ def solve(
 
     stats = {
         "elements": count,
+        "elements_wanted": count if asked is None else int(asked),
         "leaves": dr.width(mesh.leaves),
         "patches": model.patches.count,
         "pairs": pairs.evaluated,
@@ -129,27 +130,23 @@ def solve(
         "alpha": oracle.alpha,
         "lines": pairs.lines,
         "seed": seed,
-        "warnings": _warnings(count, rays, light["caustic"], flows if layers else []),
+        "warnings": [
+            *_shortfall(asked, epsilon, count, refinement.shortfall),
+            *_warnings(count, rays, light["caustic"], flows if layers else []),
+        ],
     } | ({"lamps": list(kept.names)} if layers else {})
     return Solution(exposure=problem.exposure, stats=stats, **light)
 
 
-def _clusters(model, shared, given):
+def _clusters(model, shared):
     """Labels of clusters that leave room for what the oracle splits of ``shared`` elements, if the patches are to have
-    no more than so many; which must do if it was given."""
+    no more than so many; the largest clusters that there can be, where these are more than that."""
     if shared is None:
         return None
     patches = Tree(model.patches, model.materials, model.lights).freeze()
     crossed = np.zeros(model.patches.count, dtype=bool)
     crossed[np.array(crossed_leaves(patches, model.rays))] = True
-    labels = cluster_labels(model.faces, model.patches, crossed, top_of(shared))
-    count = count_of(labels[0])
-    if given and count > shared:
-        raise RadiosityError(
-            f"{shared} elements cannot be reached: of {model.patches.count} patches only neighbours of one shape and "
-            f"of like normals share their light, so ask for {3 * count // 2} or more"
-        )
-    return labels
+    return cluster_labels(model.faces, model.patches, crossed, top_of(shared))
 
 
 def _check(oracle, elements, epsilon, rays, lines, seconds):
@@ -166,6 +163,17 @@ def _check(oracle, elements, epsilon, rays, lines, seconds):
     for name, value in (("epsilon", epsilon), ("seconds", seconds)):
         if value is not None and not 0 < value < float("inf"):
             raise RadiosityError(f"{name} must be a number greater than 0, not {value}")
+
+
+def _shortfall(asked, epsilon, count, why):
+    """What a user should know of a mesh that is not as was asked for (list of str)."""
+    if asked is not None and count > asked + 2:
+        why = "only neighbours of one shape and of like normals share their light"
+    elif (asked is None and epsilon is None) or why is None:
+        return []
+    if asked is None:
+        return [f"epsilon {epsilon:g} was not reached with {count:,} elements: {why}"]
+    return [f"the mesh has {count:,} elements instead of {asked:,}: {why}"]
 
 
 def _warnings(elements, rays, caustic, flows):

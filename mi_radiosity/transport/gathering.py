@@ -195,7 +195,8 @@ class _Pass:
         ]
         if self._problem.model.rays.lobes is not None:  # how much of the light goes straight is known to chance only
             have, want = (2 * [[a + b for a, b in zip(*both)]] for both in (have, want))
-        lost = min((sum(flow.escaped) + sum(flow.blocked)) / sum(flow.emitted), 1 - 1e-6)
+        emitted = sum(flow.emitted)
+        lost = min((sum(flow.escaped) + sum(flow.blocked)) / emitted, 1 - 1e-6) if emitted else 0.0
         # Relative variances of both totals, as if samples were independent: those that are lost are the shot's noise.
         first = flow.rays * flow.first_share * (GLANCE if self._problem.model.rays.lobes is None else 1)
         noise = lost / (1 - lost) / max(first, 1)
