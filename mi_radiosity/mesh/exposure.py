@@ -91,10 +91,10 @@ def is_covered(
     s: "mi.Float | float" = 0.3,
     t: "mi.Float | float" = 0.6,
 ) -> "mi.Bool":
-    """Are patch points (u, v) of leaves covered (Bool [n])? s, t: two numbers that say where rays look.
+    """Are patch points (u, v) of leaves covered (Bool [n])? s, t: uniform numbers that select directions of rays.
 
-    Inside of a solid, rays along the normal and in two more directions all meet sides that take no part in light
-    transport. Solids are not looked for around lamps.
+    A point is covered if it lies under another face of its plane, or if rays along the normal and in two more
+    directions all hit the inside of solids (`Rays.is_solid`). Points of emitters are not tested for solids.
     """
     patch = dr.gather(mi.UInt32, elements.patch, leaf)
     normal, lamp = dr.gather(mi.Vector3f, elements.patches.normal, patch), dr.max(elements.emission(leaf)) > 0
@@ -102,8 +102,7 @@ def is_covered(
     other = cosine_direction(normal, 1 - s, dr.select(t < 0.5, t + 0.5, t - 0.5))
 
     def inside(direction, active):
-        hit = rays.trace(origin, direction, active)
-        return active & hit.valid & (hit.patch == NONE) & ~hit.traced
+        return rays.is_solid(rays.side_met(origin, direction, active)[0])
 
     return inside(other, inside(aside, inside(normal, ~lamp))) | ~rays.on_top(patch, u, v)
 

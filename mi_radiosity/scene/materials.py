@@ -46,6 +46,8 @@ class Materials:
         self.bsdfs = mi.BSDFPtr([s.bsdf() for s in shapes])
         self.glossy = bool(dr.any(is_glossy(self.bsdfs))[0])
         self.traced_faces = owned(mi.UInt32, self.traced[faces.shape])
+        transmits = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes])
+        self._transmitting_faces = owned(mi.UInt32, transmits[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))
         plain = ~self.traced[faces.shape]
@@ -93,6 +95,10 @@ class Materials:
         if not self.traced.any():
             return mi.Bool(False)
         return dr.gather(mi.UInt32, self.traced_faces, face, active) != 0
+
+    def is_transmitting(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do faces have lobes that transmit light (Bool [n])?"""
+        return dr.gather(mi.UInt32, self._transmitting_faces, face, active) != 0
 
     def _find_albedos(self, textured):
         """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""

@@ -11,12 +11,14 @@ import numpy as np
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from .faces import Faces
+from .light_paths import light_paths
 from .lights import Lights
 from .materials import Materials, require_supported
 from .overlap import find_overlaps
 from .patches import make_patches
 from .rays import Rays
 from .reach import reached
+from .solids import seen_by_light
 from .state import Parameters, State
 
 
@@ -43,14 +45,16 @@ class Model:
         self.unreached = 0
         wanted = self._sides(self._candidate & ~overlaps.covered) if sides is None else sides
         patches = make_patches(self.faces, self.materials, self.lights, _some(wanted))
-        if sides is None and lit:
-            found = reached(self._rays(patches, overlaps), self.lights)
+        rays = self._rays(patches, overlaps)
+        paths = light_paths(rays, self.lights) if lit else None
+        if sides is None and paths:
+            found = reached(rays, self.lights, paths)
             self.unreached = int((~found).sum())
             if self.unreached:
                 patches = patches.only(_some(np.flatnonzero(found)))
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
-        self.rays = self._rays(patches, kept)
+        self.rays = self._rays(patches, kept, seen_by_light(self.faces, paths.hits) if paths else None)
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
     def with_sides(self, sides: np.ndarray) -> "Model":
@@ -81,8 +85,8 @@ class Model:
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, f.lift
         )
 
-    def _rays(self, patches, overlaps):
-        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
+    def _rays(self, patches, overlaps, in_room=None):
+        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre), in_room)
 
     def _sides(self, which):
         """Sides chosen by a mask [faces, 2], in the order of the faces' ranks."""

@@ -18,16 +18,32 @@ from .patches import Patches, patch_table
 
 
 class Rays:
-    """Visibility in a scene, in the words of its patches."""
+    """Visibility in a scene, in the words of its patches.
 
-    def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
+    Sides of faces are numbered 2 · face + (1 for the back). in_room: sides [2 · faces] that a room is behind, even
+    where they have no patch (see `scene.solids`); by default there are none.
+    """
+
+    def __init__(
+        self,
+        faces: Faces,
+        patches: Patches,
+        materials: Materials,
+        overlaps: "Lookup | None" = None,
+        in_room: np.ndarray | None = None,
+    ) -> None:
         self.scene, self.patches = faces.tracing, patches
         self._materials = materials
         self.lobes, self.glossy = Lobes() if materials.traced.any() else None, materials.glossy
         self._first_face = faces.first_face
         self.front = owned_vectors(mi.Vector3f, faces.normal)
-        self._patch_of = patch_table(faces, patches)
+        table = patch_table(faces, patches)
+        self._patch_of = owned(mi.UInt32, table)
         self.overlaps = overlaps
+        dead = (table == NONE) & ~np.repeat(materials.traced[faces.shape], 2)
+        seen = dead & (False if in_room is None else in_room)
+        self._solid = owned(mi.UInt32, dead & ~seen)
+        self.has_rooms_behind_backs = bool(seen.any())
         shines = np.array([part.shape.is_emitter() for part in faces.parts])[faces.shape]
         self._shines = owned(mi.UInt32, shines) if shines.any() else None
 
@@ -96,9 +112,42 @@ class Rays:
         """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
-        patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        traced = valid & self._materials.is_traced(face, valid)
-        return Hit(valid, dr.select(valid, patch, NONE), u, v, back, traced)
+        side = 2 * face + dr.select(back, mi.UInt32(1), 0)
+        return Hit(valid, self.patch_of(side, valid), u, v, back, valid & self._materials.is_traced(face, valid))
+
+    def patch_of(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.UInt32":
+        """The patches of sides, NONE where a side has none and where not ``active`` (UInt32 [n])."""
+        return dr.select(active, dr.gather(mi.UInt32, self._patch_of, side, active), NONE)
+
+    def side_met(
+        self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.UInt32, mi.Float, mi.Float]":
+        """The side that each ray hits, NONE for none, and (u, v) on its face (UInt32, Float, Float [n])."""
+        prelim = self.meet(origin, direction, active)
+        valid, face = self._face_met(prelim)
+        back, u, v = self._from_behind(face, direction, valid), prelim.prim_uv.x, prelim.prim_uv.y
+        if self.overlaps:
+            face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
+        return dr.select(valid, 2 * face + dr.select(back, mi.UInt32(1), 0), NONE), u, v
+
+    def is_traced_side(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do sides belong to surfaces with lobes that are not diffuse (Bool [n])?"""
+        return active & self._materials.is_traced(side >> 1, active)
+
+    def is_transmitting(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do sides belong to surfaces that let light through: with a lobe that transmits (Bool [n])?"""
+        return active & self._materials.is_transmitting(side >> 1, active)
+
+    @property
+    def side_count(self) -> int:
+        """Number of sides: two of every face."""
+        return dr.width(self._patch_of)
+
+    def is_solid(self, side: "mi.UInt32") -> "mi.Bool":
+        """Are sides (NONE allowed) the inside of a solid (Bool [n])? They have no patch, are not traced, and no room
+        is behind them (see `scene.solids`)."""
+        valid = side != NONE
+        return valid & (dr.gather(mi.UInt32, self._solid, side, valid) != 0)
 
     def follow(
         self,
