@@ -16,6 +16,9 @@ from .lookup import Lookup
 from .materials import Materials
 from .patches import Patches, patch_table
 
+EXCHANGES, SOLID, ROOM = range(3)  # sides with a patch or a traced lobe; sides without, by what they are the wall of
+GAP = 1 / 256  # of the scene's diagonal: no light to speak of gets into a gap that is narrower
+
 
 class Rays:
     """Visibility in a scene, in the words of its patches.
@@ -41,9 +44,10 @@ class Rays:
         self._patch_of = owned(mi.UInt32, table)
         self.overlaps = overlaps
         dead = (table == NONE) & ~np.repeat(materials.traced[faces.shape], 2)
-        seen = dead & (False if in_room is None else in_room)
-        self._solid = owned(mi.UInt32, dead & ~seen)
-        self.has_rooms_behind_backs = bool(seen.any())
+        room = dead & (False if in_room is None else in_room)
+        self._kind = owned(mi.UInt32, np.where(room, ROOM, np.where(dead, SOLID, EXCHANGES)))
+        self._gap = dr.opaque(mi.Float, GAP * float(np.linalg.norm(faces.high - faces.low)))
+        self.has_rooms_behind_backs = bool(room.any())
         shines = np.array([part.shape.is_emitter() for part in faces.parts])[faces.shape]
         self._shines = owned(mi.UInt32, shines) if shines.any() else None
 
@@ -123,7 +127,9 @@ class Rays:
         self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
     ) -> "tuple[mi.UInt32, mi.Float, mi.Float]":
         """The side that each ray hits, NONE for none, and (u, v) on its face (UInt32, Float, Float [n])."""
-        prelim = self.meet(origin, direction, active)
+        return self._side_at(self.meet(origin, direction, active), direction)
+
+    def _side_at(self, prelim, direction):
         valid, face = self._face_met(prelim)
         back, u, v = self._from_behind(face, direction, valid), prelim.prim_uv.x, prelim.prim_uv.y
         if self.overlaps:
@@ -143,11 +149,27 @@ class Rays:
         """Number of sides: two of every face."""
         return dr.width(self._patch_of)
 
-    def is_solid(self, side: "mi.UInt32") -> "mi.Bool":
-        """Are sides (NONE allowed) the inside of a solid (Bool [n])? They have no patch, are not traced, and no room
-        is behind them (see `scene.solids`)."""
+    def meets_solid(
+        self,
+        origin: "mi.Point3f",
+        direction: "mi.Vector3f",
+        active: "mi.Bool | bool" = True,
+        surface: "mi.Vector3f | None" = None,
+    ) -> "mi.Bool":
+        """Do rays hit the inside of a solid: a side that has no patch, is not traced, and has no room behind it (see
+        `scene.solids`) (Bool [n])?
+
+        surface: unit normals of the surfaces that rays leave. Then the far side of a gap counts as well that is
+        narrower than GAP and has no patch, even if a room is behind it.
+        """
+        prelim = self.meet(origin, direction, active)
+        side, _, _ = self._side_at(prelim, direction)
         valid = side != NONE
-        return valid & (dr.gather(mi.UInt32, self._solid, side, valid) != 0)
+        kind = dr.gather(mi.UInt32, self._kind, side, valid)
+        solid = valid & (kind == SOLID)
+        if surface is None or not self.has_rooms_behind_backs:
+            return solid
+        return solid | (valid & (kind == ROOM) & (prelim.t * dr.dot(surface, direction) < self._gap))
 
     def follow(
         self,

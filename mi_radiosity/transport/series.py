@@ -187,7 +187,8 @@ class _Series:
         goes = ~batch.doubtful | on_patch | ~hit.valid | hit.traced
         rays = problem.model.rays
         if rays.has_rooms_behind_backs:
-            goes |= ~rays.is_solid(rays.side_met(batch.origin, batch.direction, ~goes)[0])
+            start = dr.gather(mi.Vector3f, rays.patches.normal, batch.patch, ~goes)
+            goes |= ~rays.meets_solid(batch.origin, batch.direction, ~goes, start)
         tally.add(batch, hit, receiver, batch.starts & goes)
         if direct is not None:
             direct.add(batch, hit, receiver, batch.starts & goes & ~hit.bounced)
