@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import NONE, concat, opaque_index, owned
-from ..core.points import Stream, cosine_direction, hash_pair, kronecker, stream_seed, triangle, uniform
+from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle, uniform
 from .lights import Lights
 from .passing import goes_on, pass_on
 from .rays import Rays
@@ -44,12 +44,6 @@ class _Paths:
             dr.gather(mi.UInt32, self.key, rows),
         )
 
-    def where(self, choose: "mi.Bool", other: "_Paths") -> "_Paths":
-        """These paths where ``choose`` (Bool [n]), else the ``other`` ones."""
-        return _Paths(
-            dr.select(choose, self.origin, other.origin), dr.select(choose, self.direction, other.direction), self.key
-        )
-
 
 def light_paths(rays: Rays, lights: Lights) -> LightPaths:
     """Trace light paths from all emitters.
@@ -83,8 +77,8 @@ def _from_patches(rays):
     side = dr.gather(mi.UInt32, owned(mi.UInt32, rays.patches.sides[emitting]), number // each)
     seed = opaque_index(stream_seed(0, Stream.REACH, 0))
     x, y, s, t = kronecker(number % each, side, seed)
-    paths, free = _leave(rays, patch, *triangle(x, y), s, t, hash_pair(side, number % each))
-    return [paths.only(dr.compress(free))]
+    origin, direction, free = leave(rays, patch, *triangle(x, y), s, t)
+    return [_Paths(origin, direction, hash_pair(side, number % each)).only(dr.compress(free))]
 
 
 def _from_free(lights):
@@ -97,13 +91,23 @@ def _from_free(lights):
     return paths
 
 
-def _leave(rays, patch, u, v, s, t, key):
-    """Cosine-distributed segments from points of patches; and which of the points are open: nothing lies on them, and,
-    lifted off their patch, they are not behind a neighbour of it."""
+def leave(
+    rays: Rays, patch: "mi.UInt32", u: "mi.Float", v: "mi.Float", s: "mi.Float", t: "mi.Float"
+) -> "tuple[mi.Point3f, mi.Vector3f, mi.Bool]":
+    """Origin and direction of cosine-distributed rays from points of patches, and which of the points are free: nothing
+    lies on them, and, lifted off their patch, they are not behind a neighbour of it (Point3f, Vector3f, Bool [n])."""
     origin, direction = rays.leave(patch, u, v, s, t)
     above = rays.patches.above(patch, u, v)
     inwards = rays.patches.above(patch, u + INSET * (1 / 3 - u), v + INSET * (1 / 3 - v))
-    return _Paths(origin, direction, key), rays.on_top(patch, u, v) & ~rays.blocked(inwards, above)
+    return origin, direction, rays.on_top(patch, u, v) & ~rays.blocked(inwards, above)
+
+
+def sure_to_end(rays: Rays, origin: "mi.Point3f", direction: "mi.Vector3f", key: "mi.UInt32") -> "mi.Bool":
+    """Does a neighbour of each ray hit a side that has no patch and is not traced (Bool [n])? Between two faces a ray
+    may slip through, its neighbour does not. key: draws the neighbour (UInt32 [n])."""
+    jitter = mi.Vector3f(*(uniform(key, opaque_index(k)) for k in range(3))) - 0.5
+    side, _, _ = rays.side_met(origin, dr.normalize(direction + NUDGE * jitter))
+    return (side != NONE) & (rays.patch_of(side, side != NONE) == NONE) & ~rays.is_traced_side(side, side != NONE)
 
 
 def _segment(rays, paths, number, lit, hits, last):
@@ -116,11 +120,8 @@ def _segment(rays, paths, number, lit, hits, last):
     dr.eval(side, u, v, patch, traced, dead, lit)
     rows = dr.compress(dead)
     if dr.width(rows):
-        # Between two faces a ray may slip through: its neighbour does not.
-        slipped = paths.only(rows)
-        jitter = mi.Vector3f(*(uniform(slipped.key, opaque_index(number * 3 + k)) for k in range(3))) - 0.5
-        beside, _, _ = rays.side_met(slipped.origin, dr.normalize(slipped.direction + NUDGE * jitter))
-        sure = (beside != NONE) & (rays.patch_of(beside, beside != NONE) == NONE) & ~rays.is_traced_side(beside)
+        ended = paths.only(rows)
+        sure = sure_to_end(rays, ended.origin, ended.direction, ended.key)
         dr.scatter_add(hits, mi.UInt32(1), dr.gather(mi.UInt32, side, rows), sure)
     on = dr.compress(on_patch | traced)
     if last or dr.width(on) == 0:
@@ -134,11 +135,11 @@ def _next(rays, paths, number, side, u, v, patch):
     w, x, s, t = kronecker(opaque_index(number), paths.key, opaque_index(stream_seed(0, Stream.REACH, 1)))
     on_patch = patch != NONE
     if rays.lobes is None:
-        following, free = _leave(rays, patch, u, v, s, t, paths.key)
-        return following.only(dr.compress(free))
-    following, free = _leave(rays, dr.select(on_patch, patch, 0), u, v, s, t, paths.key)
+        origin, direction, free = leave(rays, patch, u, v, s, t)
+        return _Paths(origin, direction, paths.key).only(dr.compress(free))
+    *bounced, free = leave(rays, dr.select(on_patch, patch, 0), u, v, s, t)
     # Half of the paths that hit a patch through which light goes on do so themselves.
     through = goes_on(rays, side) & ~(on_patch & (uniform(paths.key, opaque_index(number)) < 0.5))
     origin, direction, carries = pass_on(rays, paths.origin, paths.direction, w, x, s, t)
-    following = _Paths(origin, direction, paths.key).where(through, following)
-    return following.only(dr.compress(dr.select(through, carries, on_patch & free)))
+    origin, direction = (dr.select(through, a, b) for a, b in zip((origin, direction), bounced))
+    return _Paths(origin, direction, paths.key).only(dr.compress(dr.select(through, carries, on_patch & free)))

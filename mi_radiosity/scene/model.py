@@ -18,7 +18,7 @@ from .overlap import find_overlaps
 from .patches import make_patches
 from .rays import Rays
 from .reach import reached
-from .solids import seen_by_light
+from .solids import seen_by_light, seen_from_patches
 from .state import Parameters, State
 
 
@@ -54,7 +54,10 @@ class Model:
                 patches = patches.only(_some(np.flatnonzero(found)))
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
-        self.rays = self._rays(patches, kept, seen_by_light(self.faces, paths.hits) if paths else None)
+        self.rays = self._rays(patches, kept)
+        rooms = seen_by_light(self.faces, paths.hits) if paths else seen_from_patches(self.faces, self.rays)
+        if rooms.any():
+            self.rays = self._rays(patches, kept, rooms)
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
     def with_sides(self, sides: np.ndarray) -> "Model":

@@ -149,6 +149,11 @@ class Rays:
         """Number of sides: two of every face."""
         return dr.width(self._patch_of)
 
+    @property
+    def sides_without_patch(self) -> np.ndarray:
+        """Which sides have no patch and are not traced (bool [sides])?"""
+        return np.array(self._kind) != EXCHANGES
+
     def meets_solid(
         self,
         origin: "mi.Point3f",
