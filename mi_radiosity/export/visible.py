@@ -4,11 +4,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, opaque_index, owned, owned_vectors
+from ..core.arrays import opaque_index, owned, owned_vectors
 from ..core.points import cosine_direction, kronecker
 from ..scene import Model
 
-LOOKS = 16  # rays per point that look for the inside of a solid
+LOOKS = 16  # rays per point
+ENCLOSED = 1 / 2  # of the rays hit the inside of a solid: others hit a floor inside of it, of a point above that floor
 POCKET = 0.05  # of the scene's diagonal: what is narrower around a point is no room,
 MOST = 14 / 16  # in so many directions
 
@@ -16,11 +17,13 @@ MOST = 14 / 16  # in so many directions
 def hidden(
     model: Model, points: np.ndarray, normals: np.ndarray, light: np.ndarray, asked: np.ndarray | None = None
 ) -> np.ndarray:
-    """Numbers of the points that lie inside of solids, or in gaps under them, not just in the dark.
+    """Numbers of the points that lie inside of solids, or in narrow pockets under and between them, and not just in the
+    dark.
 
     points, normals (unit): [n, 3]. light: what was found there [n, …]; only points that have none, and that are
-    ``asked`` for (bool [n]), are looked at: whether most of what they see are backs that take no part in light
-    transport, or whether nearly all of it is near.
+    ``asked`` for (bool [n]), are tested. A point is inside of a solid if more than ENCLOSED of its rays hit the inside
+    of one (`Rays.meets_solid`) from behind, because the fronts of walls that no light reaches are those of a dark room.
+    It is in a pocket if nearly all of its rays are shorter than POCKET.
     """
     dark = light.reshape(len(points), -1).max(axis=1, initial=0) == 0
     dark = np.flatnonzero(dark if asked is None else dark & asked)
@@ -29,14 +32,15 @@ def hidden(
     x, normal = _above(model, points[dark], normals[dark])
     size = np.linalg.norm(np.ptp(model.faces.corners.reshape(-1, 3), axis=0))
     reach = dr.opaque(mi.Float, POCKET * float(size))
-    every, backs, near = dr.arange(mi.UInt32, len(dark)), mi.UInt32(0), mi.UInt32(0)
+    every, solid, near = dr.arange(mi.UInt32, len(dark)), mi.UInt32(0), mi.UInt32(0)
     for look in range(LOOKS):
         _, _, s, t = kronecker(opaque_index(look), every, opaque_index(0))
         direction = cosine_direction(normal, s, t)
-        hit = model.rays.trace(x + model.patches.origin, direction)
-        backs += dr.select(hit.valid & hit.back & (hit.patch == NONE) & ~hit.traced, mi.UInt32(1), 0)
+        start = x + model.patches.origin
+        inside = model.rays.meets_solid(start, direction) & model.rays.trace(start, direction).back
+        solid += dr.select(inside, mi.UInt32(1), 0)
         near += dr.select(model.rays.blocked(x, x + direction * reach), mi.UInt32(1), 0)
-    return dark[np.array((near >= MOST * LOOKS) | (2 * backs > LOOKS)).astype(bool)]
+    return dark[np.array((near >= MOST * LOOKS) | (solid > ENCLOSED * LOOKS)).astype(bool)]
 
 
 def on_top(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:

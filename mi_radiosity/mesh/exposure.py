@@ -62,8 +62,15 @@ def _open_area(elements, rays, seed):
     if dr.width(doubtful) == 0:
         return elements.area
     doubtful = dr.gather(mi.UInt32, elements.leaves, doubtful)
+    open_share = 1 - _covered_share(elements, rays, doubtful, LOOK, seed)
+    if rays.has_rooms_behind_backs:
+        # A leaf that lies in a gap as a whole keeps its area: no part of it is left that its light could belong to.
+        closed = dr.compress(open_share == 0)
+        if dr.width(closed):
+            leaves = dr.gather(mi.UInt32, doubtful, closed)
+            dr.scatter(open_share, 1 - _covered_share(elements, rays, leaves, LOOK, seed, gaps=False), closed)
     share = dr.full(mi.Float, 1, len(elements))
-    dr.scatter(share, dr.maximum(1 - _covered_share(elements, rays, doubtful, LOOK, seed), LEAST), doubtful)
+    dr.scatter(share, dr.maximum(open_share, LEAST), doubtful)
     area = mi.Float64(dr.gather(mi.Float, elements.area * share, elements.leaves))
     sums = sum_up(elements, [area, mi.Float64(0), mi.Float64(0)], [2 * elements.patches.total_area, 1, 1])
     result = mi.Float(sums.gather(dr.arange(mi.UInt32, len(elements)))[0])
@@ -72,13 +79,13 @@ def _open_area(elements, rays, seed):
     return result
 
 
-def _covered_share(elements, rays, leaves, points, seed):
+def _covered_share(elements, rays, leaves, points, seed, gaps=True):
     """Share of ``points`` points of each leaf that are covered (Float [leaves])."""
     each = opaque_index(points)
     k = dr.arange(mi.UInt32, dr.width(leaves) * points)
     leaf = dr.gather(mi.UInt32, leaves, k // each)
     x0, x1, s, t = kronecker(k % each, elements.key(leaves), opaque_index(stream_seed(seed, Stream.COVER)), k // each)
-    covered = is_covered(elements, rays, leaf, *elements.patch_point(leaf, *triangle(x0, x1)), s, t)
+    covered = is_covered(elements, rays, leaf, *elements.patch_point(leaf, *triangle(x0, x1)), s, t, gaps)
     return mi.Float(dr.block_sum(dr.select(covered, mi.UInt32(1), 0), points)) / mi.Float(each)
 
 
@@ -90,11 +97,13 @@ def is_covered(
     v: "mi.Float",
     s: "mi.Float | float" = 0.3,
     t: "mi.Float | float" = 0.6,
+    gaps: bool = True,
 ) -> "mi.Bool":
-    """Are patch points (u, v) of leaves covered (Bool [n])? s, t: two numbers that say where rays look.
+    """Are patch points (u, v) of leaves covered (Bool [n])? s, t: uniform numbers that select directions of rays.
 
-    Inside of a solid, rays along the normal and in two more directions all meet sides that take no part in light
-    transport. Solids are not looked for around lamps.
+    A point is covered if it lies under another face of its plane, or if rays along the normal and in two more
+    directions all hit the inside of solids, or with ``gaps`` the far side of a narrow gap (`Rays.meets_solid`). Points
+    of emitters are tested for neither.
     """
     patch = dr.gather(mi.UInt32, elements.patch, leaf)
     normal, lamp = dr.gather(mi.Vector3f, elements.patches.normal, patch), dr.max(elements.emission(leaf)) > 0
@@ -102,8 +111,7 @@ def is_covered(
     other = cosine_direction(normal, 1 - s, dr.select(t < 0.5, t + 0.5, t - 0.5))
 
     def inside(direction, active):
-        hit = rays.trace(origin, direction, active)
-        return active & hit.valid & (hit.patch == NONE) & ~hit.traced
+        return rays.meets_solid(origin, direction, active, normal if gaps else None)
 
     return inside(other, inside(aside, inside(normal, ~lamp))) | ~rays.on_top(patch, u, v)
 

@@ -20,7 +20,7 @@ NESTING = {"TwoSidedBRDF", "BlendBSDF"}
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 FRAMES = {"NormalMap", "BumpMap"}
-BENT = 2
+LOBES, BENT = 1, 2  # flags of faces
 WHITEST, ROUNDING = 0.999, 1e-4
 SOLID_SAMPLES = 1 << 15  # for the albedo of a shape
 LEAST = 1 << 6  # samples of a face of a textured shape, if there are many; SOLID_SAMPLES if there are few
@@ -49,9 +49,11 @@ class Materials:
         self.bsdfs = mi.BSDFPtr([s.bsdf() for s in shapes])
         bent_frames = np.array([has_bent_frames(s.bsdf()) for s in shapes])
         self.bent = faces.bent | bent_frames[faces.shape]
-        # 0: plainly diffuse; 1: other lobes as well; 2: shading normals that the cache of radiosity does not have.
-        self._kind = owned(mi.UInt32, np.where(self.bent, BENT, self.traced[faces.shape]))
+        # 0: plainly diffuse.
+        self._kind = owned(mi.UInt32, LOBES * self.traced[faces.shape] | BENT * self.bent)
         self.all_plain = not (self.traced.any() or self.bent.any())
+        transmits = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes])
+        self._transmitting_faces = owned(mi.UInt32, transmits[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
         self.rho = np.zeros((2, len(faces), 3))
         plain = np.flatnonzero(~self.traced[faces.shape])
@@ -99,11 +101,21 @@ class Materials:
         """Are the shading normals of faces far from the geometric one (Bool [n])?"""
         if self.all_plain:
             return mi.Bool(False)
-        return dr.gather(mi.UInt32, self._kind, face, active) == BENT
+        return (dr.gather(mi.UInt32, self._kind, face, active) & BENT) != 0
+
+    def has_lobes(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Have faces lobes other than a diffuse one (Bool [n])?"""
+        if self.all_plain:
+            return mi.Bool(False)
+        return (dr.gather(mi.UInt32, self._kind, face, active) & LOBES) != 0
 
     def arrays(self) -> list:
         """What `is_traced` and `is_bent` read, and Mitsuba's BSDFs."""
         return [self._kind, self.bsdfs]
+
+    def is_transmitting(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do faces have lobes that transmit light (Bool [n])?"""
+        return dr.gather(mi.UInt32, self._transmitting_faces, face, active) != 0
 
     def _find_albedos(self, textured):
         """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""

@@ -11,12 +11,14 @@ import numpy as np
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from .faces import Faces
+from .light_paths import light_paths
 from .lights import Lights
 from .materials import Materials, require_supported
 from .overlap import find_overlaps
 from .patches import make_patches
 from .rays import Rays
 from .reach import reached
+from .solids import seen_by_light, seen_from_patches
 from .state import Parameters, State
 
 
@@ -43,11 +45,12 @@ class Model:
         self.unreached = 0
         wanted = self._sides(self._candidate & ~overlaps.covered) if sides is None else sides
         patches = make_patches(self.faces, self.materials, self.lights, _some(wanted))
-        found = np.ones(patches.count, dtype=bool)
-        if lit and not self.lights.any_power:
+        rays, found = self._rays(patches, overlaps), np.ones(patches.count, dtype=bool)
+        paths = light_paths(rays, self.lights) if lit and self.lights.any_power else None
+        if lit and not paths:
             self.faces.warnings.append("no emitter has any power: the solution is black")
-        elif lit and sides is None:
-            found = reached(self._rays(patches, overlaps), self.lights)
+        elif sides is None and paths:
+            found = reached(rays, self.lights, paths)
             if not found.any():
                 self.faces.warnings.append("no light reaches any surface with a diffuse lobe: the solution is black")
                 found[:] = True
@@ -57,6 +60,9 @@ class Model:
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
         self.rays = self._rays(patches, kept)
+        rooms = seen_by_light(self.faces, paths.hits) if paths else seen_from_patches(self.faces, self.rays)
+        if rooms.any():
+            self.rays = self._rays(patches, kept, rooms)
         self.warnings = self.faces.warnings + self._warn_of(doubled)
 
     def with_sides(self, sides: np.ndarray) -> "Model":
@@ -87,8 +93,8 @@ class Model:
             f, self._candidate, np.column_stack([exitance, 0 * exitance]), self.materials.rho.sum(axis=2).T, f.lift
         )
 
-    def _rays(self, patches, overlaps):
-        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre))
+    def _rays(self, patches, overlaps, in_room=None):
+        return Rays(self.faces, patches, self.materials, overlaps.lookup(self.faces.centre), in_room)
 
     def _sides(self, which):
         """Sides chosen by a mask [faces, 2], in the order of the faces' ranks."""

@@ -15,6 +15,7 @@ GUESS = 12  # pairs of faces that are near each other, per face
 FINEST = 30  # a grid has up to 2^30 cells along an axis
 LOOKERS, FINER = 2, 4  # a cell is halved up to 4 times, where 8, 32, 128, 512 faces look for one that is there
 ABOUT = 0.999  # of the area of another face: as large, to float32
+FLAT = 1 - 1e-6  # cosine between normals of faces in one plane
 LATTICE = 8  # points along a side that show whether a face is covered
 
 
@@ -311,9 +312,10 @@ def _covered(corners, under, over, shape):
     return covered
 
 
-def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """A number per face, the same for faces of one plane that share edges and run along them in opposite directions;
-    from the numbers of their corners [faces, 3] (int [faces])."""
+def surfaces(vertex: np.ndarray, normal: np.ndarray, min_cosine: float = FLAT) -> np.ndarray:
+    """A number per face, the same for faces that share edges, run along them in opposite directions, and whose normals
+    have at least that cosine, by default only those of one plane; from the numbers of their corners [faces, 3] (int
+    [faces])."""
     tail, head = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel()
     edge = np.minimum(tail, head) << 32 | np.maximum(tail, head) << 1 | (tail > head)
     order = np.argsort(edge)
@@ -325,7 +327,7 @@ def surfaces(vertex: np.ndarray, normal: np.ndarray) -> np.ndarray:
         one = one[: np.searchsorted(one, len(order) - step)]
         one = one[edge[one] >> 1 == edge[one + step] >> 1]
         f, g = face[one], face[one + step]
-        level = np.einsum("ij,ij->i", normal[f], normal[g]) > 1 - 1e-6
+        level = np.einsum("ij,ij->i", normal[f], normal[g]) > min_cosine
         links.append(np.array([f, g])[:, level & (edge[one] != edge[one + step])])
     return components(len(vertex), *np.hstack(links)) if links else np.arange(len(vertex))
 

@@ -90,9 +90,9 @@ def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.n
     )
 
 
-def patch_table(faces: Faces, patches: Patches) -> "mi.UInt32":
-    """The patch of every side 2 · face + (1 for the back), NONE where there is none (UInt32 [2 · faces])."""
+def patch_table(faces: Faces, patches: Patches) -> np.ndarray:
+    """The patch of every side 2 · face + (1 for the back), NONE where there is none (uint32 [2 · faces])."""
     face, back = faces.order[patches.sides // 2], patches.sides % 2
     table = np.full(2 * len(faces), NONE, dtype=np.uint32)
     table[2 * face + back] = np.arange(patches.count)
-    return owned(mi.UInt32, table)
+    return table

@@ -15,18 +15,38 @@ from .lookup import Lookup
 from .materials import Materials
 from .patches import Patches, patch_table
 
+EXCHANGES, SOLID, ROOM = range(3)  # sides with a patch or a traced lobe; sides without, by what they are the wall of
+GAP = 1 / 256  # of the scene's diagonal: no light to speak of gets into a gap that is narrower
+
 
 class Rays:
-    """Visibility in a scene, in the words of its patches."""
+    """Visibility in a scene, in the words of its patches.
 
-    def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
+    Sides of faces are numbered 2 · face + (1 for the back). in_room: sides [2 · faces] that a room is behind, even
+    where they have no patch (see `scene.solids`); by default there are none.
+    """
+
+    def __init__(
+        self,
+        faces: Faces,
+        patches: Patches,
+        materials: Materials,
+        overlaps: "Lookup | None" = None,
+        in_room: np.ndarray | None = None,
+    ) -> None:
         self.scene, self.patches = faces.tracing, patches
         self._materials = materials
         self.lobes = None if materials.all_plain else Lobes()
         self._first_face = faces.first_face
         self.front = owned_vectors(mi.Vector3f, faces.normal)
-        self._patch_of = patch_table(faces, patches)
+        table = patch_table(faces, patches)
+        self._patch_of = owned(mi.UInt32, table)
         self.overlaps = overlaps
+        dead = (table == NONE) & ~np.repeat(materials.traced[faces.shape], 2)
+        room = dead & (False if in_room is None else in_room)
+        self._kind = owned(mi.UInt32, np.where(room, ROOM, np.where(dead, SOLID, EXCHANGES)))
+        self._gap = dr.opaque(mi.Float, GAP * float(np.linalg.norm(faces.high - faces.low)))
+        self.has_rooms_behind_backs = bool(room.any())
         shines = np.array([part.shape.is_emitter() for part in faces.parts])[faces.shape]
         self._shines = owned(mi.UInt32, shines) if shines.any() else None
 
@@ -95,9 +115,65 @@ class Rays:
         """Name the patches of points (u, v) of faces, on their backs where ``back``."""
         if self.overlaps:
             face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
-        patch = dr.gather(mi.UInt32, self._patch_of, 2 * face + dr.select(back, mi.UInt32(1), 0), valid)
-        traced = valid & self._materials.is_traced(face, valid)
-        return Hit(valid, dr.select(valid, patch, NONE), u, v, back, traced)
+        side = 2 * face + dr.select(back, mi.UInt32(1), 0)
+        return Hit(valid, self.patch_of(side, valid), u, v, back, valid & self._materials.is_traced(face, valid))
+
+    def patch_of(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.UInt32":
+        """The patches of sides, NONE where a side has none and where not ``active`` (UInt32 [n])."""
+        return dr.select(active, dr.gather(mi.UInt32, self._patch_of, side, active), NONE)
+
+    def side_met(
+        self, origin: "mi.Point3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.UInt32, mi.Float, mi.Float]":
+        """The side that each ray hits, NONE for none, and (u, v) on its face (UInt32, Float, Float [n])."""
+        return self._side_at(self.meet(origin, direction, active), direction)
+
+    def _side_at(self, prelim, direction):
+        valid, face = self._face_met(prelim)
+        back, u, v = self._from_behind(face, direction, valid), prelim.prim_uv.x, prelim.prim_uv.y
+        if self.overlaps:
+            face, back, u, v = self.overlaps.owner(face, back, u, v, valid)
+        return dr.select(valid, 2 * face + dr.select(back, mi.UInt32(1), 0), NONE), u, v
+
+    def is_traced_side(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do sides belong to surfaces with lobes that are not diffuse (Bool [n])?"""
+        return active & self._materials.has_lobes(side >> 1, active)
+
+    def is_transmitting(self, side: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
+        """Do sides belong to surfaces that let light through: with a lobe that transmits (Bool [n])?"""
+        return active & self._materials.is_transmitting(side >> 1, active)
+
+    @property
+    def side_count(self) -> int:
+        """Number of sides: two of every face."""
+        return dr.width(self._patch_of)
+
+    @property
+    def sides_without_patch(self) -> np.ndarray:
+        """Which sides have no patch and are not traced (bool [sides])?"""
+        return np.array(self._kind) != EXCHANGES
+
+    def meets_solid(
+        self,
+        origin: "mi.Point3f",
+        direction: "mi.Vector3f",
+        active: "mi.Bool | bool" = True,
+        surface: "mi.Vector3f | None" = None,
+    ) -> "mi.Bool":
+        """Do rays hit the inside of a solid: a side that has no patch, is not traced, and has no room behind it (see
+        `scene.solids`) (Bool [n])?
+
+        surface: unit normals of the surfaces that rays leave. Then the far side of a gap counts as well that is
+        narrower than GAP and has no patch, even if a room is behind it.
+        """
+        prelim = self.meet(origin, direction, active)
+        side, _, _ = self._side_at(prelim, direction)
+        valid = side != NONE
+        kind = dr.gather(mi.UInt32, self._kind, side, valid)
+        solid = valid & (kind == SOLID)
+        if surface is None or not self.has_rooms_behind_backs:
+            return solid
+        return solid | (valid & (kind == ROOM) & (prelim.t * dr.dot(surface, direction) < self._gap))
 
     def follow(
         self,

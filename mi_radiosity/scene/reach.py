@@ -4,44 +4,45 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import NONE, components, owned
+from ..core.arrays import NONE, components, opaque_index, owned
 from ..core.points import ROUNDS, Stream, hash_pair, kronecker, stream_seed, triangle
+from .light_paths import LightPaths
 from .lights import Lights
+from .passing import goes_on, pass_on
 from .rays import Rays
 
 GLANCES, PROBES = 2, 32  # rays per side that look for light: of all, and of those that found none
 FEW = 1 << 14  # sides: so many look with all their rays at once
 MOST_PROBES = 1 << 23  # rays of all sides together, where there are that many
-LAMP_PROBES = 1 << 16  # rays from all lamps together
+MAX_SURFACES = 16  # through which a ray goes on
 
 
-def reached(rays: Rays, lights: Lights) -> np.ndarray:
+def reached(rays: Rays, lights: Lights, paths: LightPaths) -> np.ndarray:
     """Which patches can light reach (bool [patches])?
 
-    Every patch casts GLANCES rays and the lamps LAMP_PROBES; light spreads along them, in both
-    directions, until nothing new is reached. What is still dark looks again, with PROBES rays. As rays hardly find
-    lamps that are small or seen at a grazing angle, and those of lamps that are no surfaces hardly find small patches,
-    every patch draws as many lines to lamps of either kind as well. A ray that leaves the scene sees the sky, if
-    there is one.
+    ``paths`` are light paths from all emitters; what they hit is lit. Every patch casts GLANCES rays, which go on
+    through surfaces that pass light on (see `_cast`). Light spreads along the rays, in both directions, until nothing
+    new is reached. What is still dark casts PROBES rays. Rays hardly find emitters that are small or seen at a grazing
+    angle, and light paths hardly find small patches, so every patch traces as many shadow rays to emitters as well.
+    A ray that leaves the scene sees the sky, if there is one.
     """
     patches = rays.patches
     emits = np.array(dr.max(patches.emission) > 0).astype(bool)
-    lit = emits | _met_by_free(rays, lights)
-    links = [_from_lamps(rays, np.flatnonzero(emits))] if emits.any() else []
+    lit, links = emits | paths.lit, []
     dark = np.arange(patches.count)
     probes = max(4 * GLANCES, min(PROBES, MOST_PROBES // patches.count))
     glances = PROBES if patches.count <= FEW else GLANCES
     for first, last in ((0, glances), (glances, probes)):
         source, number = np.repeat(dark, last - first), np.tile(np.arange(first, last), len(dark))
-        target, escaped = _cast(rays, source, number)
-        links.append((source, target))
+        joined, escaped = _cast(rays, source, number)
+        links += joined
         if emits.any():
             links.append(_towards_lamps(rays, np.flatnonzero(emits), source, number))
         if lights.sky_light:
-            lit[source[escaped]] = True
+            lit[escaped] = True
         lit[_see_free(rays, lights, source, number)] = True
         a, b = (np.concatenate(ends) for ends in zip(*links))
-        label = components(patches.count, a[b != NONE], b[b != NONE])
+        label = components(patches.count, a, b)
         found = np.zeros(patches.count, dtype=bool)
         found[label[lit]] = True
         found = found[label]
@@ -52,30 +53,36 @@ def reached(rays: Rays, lights: Lights) -> np.ndarray:
 
 
 def _cast(rays, patch, number):
-    """Patches that cosine-distributed rays from patches meet, NONE for none, and which of them leave the scene (int,
-    bool [n])."""
-    seed = dr.opaque(mi.UInt32, stream_seed(0, Stream.REACH))
+    """Links between patches that one cosine-distributed ray per entry finds (list of pairs of int arrays), and the
+    patches from which rays leave the scene (int).
+
+    A ray ends at the first surface with nothing but diffuse reflection; it links all patches it hits. It goes on
+    through up to MAX_SURFACES others, by one sampled lobe each, so there are at most MAX_SURFACES + 1 segments per ray.
+    """
+    seed = opaque_index(stream_seed(0, Stream.REACH))
     patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
     u, v, s, t = kronecker(number, patch, seed)
     origin, direction = rays.leave(patch, *triangle(u, v), s, t)
-    hit = rays.trace(origin, direction)
-    end, valid = hit.patch, hit.valid
-    dr.eval(end, valid, origin, direction)
-    # What has no diffuse lobe sends them on; of the others their light gets some.
-    on = dr.compress(valid & (end == NONE)) if rays.lobes else mi.UInt32()
-    if dr.width(on):
-        start = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
-        last = rays.follow(*start, dr.gather(mi.UInt32, hash_pair(patch, number), on), seed)
-        dr.scatter(end, last.patch, on)
-        dr.scatter(valid, last.valid, on)
-    return np.array(end), ~np.array(valid).astype(bool)
-
-
-def _from_lamps(rays, lamps):
-    """Links of lamps to what their rays meet."""
-    each = -(-LAMP_PROBES // len(lamps))
-    source = np.repeat(lamps, each)
-    return source, _cast(rays, source, np.tile(np.arange(each), len(lamps)))[0]
+    links, escaped = [], []
+    for depth in range(MAX_SURFACES + 1):
+        side, _, _ = rays.side_met(origin, direction)
+        hit = rays.patch_of(side, side != NONE)
+        dr.eval(side, hit, origin, direction)
+        linked = np.array(hit) != NONE
+        links.append((np.array(patch)[linked], np.array(hit)[linked]))
+        escaped.append(np.array(patch)[np.array(side) == NONE])
+        on = dr.compress(goes_on(rays, side)) if rays.lobes else mi.UInt32()
+        if depth == MAX_SURFACES or dr.width(on) == 0:
+            break
+        origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
+        patch, hit, number = (dr.gather(mi.UInt32, x, on) for x in (patch, hit, number))
+        w, x, s, t = kronecker(opaque_index(depth), hash_pair(patch, number), seed)
+        patch = dr.select(hit != NONE, hit, patch)
+        origin, direction, carries = pass_on(rays, origin, direction, w, x, s, t)
+        on = dr.compress(carries)
+        origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
+        patch, number = (dr.gather(mi.UInt32, x, on) for x in (patch, number))
+    return links, np.concatenate(escaped)
 
 
 def _towards_lamps(rays, lamps, patch, number):
@@ -90,17 +97,6 @@ def _towards_lamps(rays, lamps, patch, number):
     above = (dr.dot(here, d) > p.lift) & (-dr.dot(there, d) > p.lift)
     sees = np.array(above & (rays.kernel(patch, *x, lamp, *y) > 0)).astype(bool)
     return np.array(lamp)[sees], np.array(patch)[sees]
-
-
-def _met_by_free(rays, lights):
-    """Which patches are met by rays of lamps that are no surfaces (bool [patches])?"""
-    lit = np.zeros(rays.patches.count, dtype=bool)
-    for number, light in enumerate(lights.free):
-        n, seed = dr.arange(mi.UInt32, LAMP_PROBES // len(lights.free)), dr.opaque(mi.UInt32, number)
-        origin, direction, _ = light.shoot(*kronecker(n, seed, seed))
-        met = np.array(rays.follow(origin, direction, n, seed).patch)
-        lit[met[met != NONE]] = True
-    return lit
 
 
 def _see_free(rays, lights, source, number):

@@ -192,7 +192,7 @@ def _ends(facets, cell, numbers, up):
         backs = dr.compress(end == opaque_index(n + OUTSIDE.index("backs")))
         if dr.width(backs):
             inside = [dr.gather(type(a), a, backs) for a in (element, u, v, s, t)]
-            dr.scatter(end, mi.UInt32(NONE), backs, is_covered(elements, rays, *inside))
+            dr.scatter(end, mi.UInt32(NONE), backs, is_covered(elements, rays, *inside, gaps=False))
         dr.scatter(met, end, doubtful)
     return met
 

@@ -185,6 +185,10 @@ class _Series:
         on_patch = hit.patch != NONE
         # Rays that start inside a solid go nowhere; the others of their element carry their power.
         goes = ~batch.doubtful | on_patch | ~hit.valid | hit.traced
+        rays = problem.model.rays
+        if rays.has_rooms_behind_backs:
+            start = dr.gather(mi.Vector3f, rays.patches.normal, batch.patch, ~goes)
+            goes |= ~rays.meets_solid(batch.origin, batch.direction, ~goes, start)
         tally.add(batch, hit, receiver, batch.starts & goes)
         if direct is not None:
             direct.add(batch, hit, receiver, batch.starts & goes & ~hit.bounced)
