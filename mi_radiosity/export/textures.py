@@ -7,10 +7,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.color import srgb8
-from ..scene.tessellate import Part
+from ..core.errors import warn_of
+from ..scene.tessellate import Part, children
 from .geometry import LitMesh
 
 FEWEST, MOST = 512, 2048  # pixels along a side
+FLAT = 1e-3  # extent of a texture along a coordinate that is the same all over a shape
+CELL = 16  # pixels along a cell of a checkerboard, so that its edges are sharp
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,17 @@ def textures(mesh: LitMesh, parts: list[Part]) -> dict[tuple[int, bool], Texture
         part = textured & (mesh.shape == shape) & (mesh.back == back)
         uv = mesh.uv[np.unique(mesh.triangles[part])]
         low, high = uv.min(axis=0), uv.max(axis=0)
-        if (high > low).all():
-            found[shape, back] = _bake(parts[shape].shape.bsdf(), back, low, high)
+        high = np.where(high > low, high, low + FLAT)
+        found[shape, back] = _bake(parts[shape], back, low, high)
     return found
 
 
-def _bake(bsdf, back, low, high):
-    size = _resolution(bsdf, high - low)
+def _bake(part, back, low, high):
+    bsdf, wanted = part.shape.bsdf(), np.ceil(_density(part.shape.bsdf()) * (high - low))
+    size = tuple(int(n) for n in np.clip(wanted, FEWEST, MOST))
+    if (wanted > MOST).any():
+        need = " x ".join(f"{n:,.0f}" for n in wanted)
+        warn_of(f"{part.name}: its texture needs {need} pixels, and has {size[0]:,} x {size[1]:,} in the file")
     x, y = (k.ravel().astype(np.float32) for k in np.meshgrid(*(np.arange(n) + 0.5 for n in size)))
     si = dr.zeros(mi.SurfaceInteraction3f, x.size)
     si.uv = mi.Point2f(
@@ -69,8 +76,22 @@ def _bake(bsdf, back, low, high):
     return Texture(rho, low, high)
 
 
-def _resolution(bsdf, span):
-    """Width and height in pixels: at least those of the largest bitmap in a BSDF, as often as it is repeated."""
-    bitmaps = [value.shape for name, value in mi.traverse(bsdf) if name.endswith("data") and dr.is_tensor_v(value)]
-    size = np.max(bitmaps, axis=0)[1::-1] if bitmaps else np.array([FEWEST, FEWEST])
-    return tuple(int(n) for n in np.clip(np.ceil(size * span), FEWEST, MOST))
+def _density(thing):
+    """Pixels per unit of u and v that the textures in a BSDF need: the finest of all (float [2])."""
+    finest = np.zeros(2)
+    for part in children(thing):
+        if isinstance(part, mi.BSDF):
+            finest = np.maximum(finest, _density(part))
+            continue
+        values = dict(mi.traverse(part))
+        if "data" in values:
+            size = np.array(values["data"].shape[1::-1], dtype=np.float64)
+        elif part.class_name() == "Checkerboard":
+            size = np.full(2, 2.0 * CELL)  # two cells per unit
+        else:
+            continue
+        if "to_uv" in values:  # columns: where steps of u and v go in the texture
+            matrix = np.array(values["to_uv"].matrix, dtype=np.float64).reshape(3, 3, -1)[:2, :2, 0]
+            size = np.linalg.norm(matrix * size[:, None], axis=0)
+        finest = np.maximum(finest, size)
+    return finest
