@@ -15,6 +15,7 @@ FORMATS = {  # `pixel_format` of hdrfilm: the format of bitmaps
     "xyz": "XYZ",
     "xyza": "XYZA",
 }
+PRINTED = {"y": "luminance", "ya": "luminance_alpha"}  # what descriptions of films call two of them
 COMPONENTS = {"float16": "Float16", "float32": "Float32", "uint32": "UInt32"}
 
 
@@ -23,7 +24,8 @@ def film_settings(film: "mi.Film") -> dict[str, str]:
 
     Mitsuba shows these to Python only in the film's description.
     """
-    return dict(re.findall(r"^  (\w+) = (\w+),?$", str(film), flags=re.MULTILINE))
+    found = dict(re.findall(r"^  (\w+) = (\w+),?$", str(film), flags=re.MULTILINE))
+    return {name: PRINTED.get(value, value) for name, value in found.items()}
 
 
 def pixel_format(film: "mi.Film") -> "mi.Bitmap.PixelFormat":

@@ -33,6 +33,15 @@ FILTERS: dict[str, tuple[str, Callable[["mi.ReconstructionFilter"], dict[str, fl
 }
 
 
+SAMPLERS = {  # class: plugin
+    "IndependentSampler": "independent",
+    "StratifiedSampler": "stratified",
+    "MultijitterSampler": "multijitter",
+    "OrthogonalSampler": "orthogonal",
+    "LowDiscrepancySampler": "ldsampler",
+}
+
+
 @dataclass(frozen=True)
 class Film:
     """A film: its size and window in pixels, and how pictures are made of samples."""
@@ -53,6 +62,7 @@ class Camera:
     kind: str  # Mitsuba's plugin
     to_world: np.ndarray  # [4, 4]; it looks along +z, with +y up and +x to the left
     film: Film
+    sampler: str  # Mitsuba's plugin
     samples: int
     shutter: tuple[float, float]  # opens and closes, s
     x_fov: float = 0.0  # degrees, across the width of the film
@@ -129,6 +139,7 @@ def _camera(sensor, name):
         kind=kind,
         to_world=np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4, -1)[..., 0],
         film=film,
+        sampler=SAMPLERS.get(sensor.sampler().class_name(), "independent"),
         samples=int(sensor.sampler().sample_count()),
         shutter=(opens, opens + float(sensor.shutter_open_time())),
         x_fov=_number(values.get("x_fov", 0)),

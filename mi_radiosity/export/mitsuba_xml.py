@@ -68,7 +68,7 @@ def _add_sensor(parent, view):
     if view.kind != "batch":
         _add(_add(sensor, "transform", name="to_world"), "matrix", value=_text(view.to_world.ravel()))
     _add_film(sensor, view.film)
-    _add(_add(sensor, "sampler", type="independent"), "integer", name="sample_count", value=str(view.samples))
+    _add(_add(sensor, "sampler", type=view.sampler), "integer", name="sample_count", value=str(view.samples))
 
 
 def _sensor_numbers(view):
