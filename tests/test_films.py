@@ -134,13 +134,16 @@ def test_values_that_float16_does_not_hold_are_told(tmp_path):
 
 
 XML = """<scene version="3.0.0"><integrator type="aov"><string name="aovs" value="z:depth"/>
-<integrator type="path"><boolean name="hide_emitters" value="true"/><integer name="max_depth" value="-1"/></integrator></integrator>
+<integrator type="path"><boolean name="hide_emitters" value="true"/><integer name="max_depth" value="-1"/></integrator>
+</integrator>
 <sensor type="thinlens" id="lens"><float name="aperture_radius" value="0.1"/><float name="focus_distance" value="5"/>
 <transform name="to_world"><lookat origin="0, 0, 5" target="0, 0, 0" up="0, 1, 0"/></transform>
-<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/><string name="pixel_format" value="FORMAT"/>
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/>
+<string name="pixel_format" value="FORMAT"/>
 <string name="component_format" value="float32"/><rfilter type="box"/></film></sensor>
 <shape type="rectangle" id="plate"><bsdf type="diffuse"><rgb name="reflectance" value="0.8 0.4 0.1"/></bsdf></shape>
-<shape type="rectangle" id="lamp"><transform name="to_world"><scale value="0.2"/><rotate x="1" angle="180"/><translate z="1"/></transform>
+<shape type="rectangle" id="lamp">
+<transform name="to_world"><scale value="0.2"/><rotate x="1" angle="180"/><translate z="1"/></transform>
 <emitter type="area"><rgb name="radiance" value="9"/></emitter></shape></scene>"""
 
 
@@ -206,7 +209,8 @@ def many_sensors():
     """One of every sensor that Mitsuba ships, with films that differ."""
     pixel = {"film": film(size=1)}
     window = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 7, "crop_height": 6}
-    mitchell = {"type": "mitchell", "B": 0.25, "C": 0.5}
+    mitchell = {"sample_border": True, "rfilter": {"type": "mitchell", "B": 0.25, "C": 0.5}}
+    wide = {"type": "hdrfilm", "width": 24, "height": 12, "rfilter": {"type": "lanczos"}}
     batch = {
         "a": camera(fov=30),
         "b": {"type": "thinlens", "aperture_radius": 0.3, "focus_distance": 3.0, "to_world": LOOK},
@@ -216,18 +220,18 @@ def many_sensors():
         {"type": "thinlens", "id": "lens", "aperture_radius": 0.2, "focus_distance": 4.0, "to_world": LOOK,
          "film": film("xyza", rfilter={"type": "gaussian", "stddev": 0.637}, component_format="float32"),
          "sampler": {"type": "multijitter", "sample_count": 9}},
-        {"type": "orthographic", "id": "plan", "to_world": LOOK, "film": film("luminance", sample_border=True, rfilter=mitchell)},
+        {"type": "orthographic", "id": "plan", "to_world": LOOK, "film": film("luminance", **mitchell)},
         {"type": "radiancemeter", "id": "meter", "to_world": LOOK, **pixel},
         {"type": "distant", "id": "far", "direction": [0.1, 0, -1], "target": [0, 0, 0], **pixel},
-        {"type": "batch", "id": "pair", "film": {"type": "hdrfilm", "width": 24, "height": 12, "rfilter": {"type": "lanczos"}}} | batch,
+        {"type": "batch", "id": "pair", "film": wide} | batch,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def watched():
-    scene = plate(*many_sensors(), patch=rectangle(
-        T().translate([-0.5, 0, 0.2]).scale(0.2), bsdf=diffuse(), sensor={"type": "irradiancemeter", "film": film(size=1)}
-    ))  # fmt: skip
+    meter = {"type": "irradiancemeter", "film": film(size=1)}
+    patch = rectangle(T().translate([-0.5, 0, 0.2]).scale(0.2), bsdf=diffuse(), sensor=meter)
+    scene = plate(*many_sensors(), patch=patch)
     return mr.solve(scene, elements=300, rays=60_000)
 
 

@@ -24,8 +24,8 @@ def film_settings(film: "mi.Film") -> dict[str, str]:
 
     Mitsuba shows these to Python only in the film's description.
     """
-    found = dict(re.findall(r"^  (\w+) = (\w+),?$", str(film), flags=re.MULTILINE))
-    return {name: PRINTED.get(value, value) for name, value in found.items()}
+    found: dict[str, str] = dict(re.findall(r"^  (\w+) = (\w+),?$", str(film), flags=re.MULTILINE))
+    return {name: PRINTED[value] if value in PRINTED else value for name, value in found.items()}
 
 
 def pixel_format(film: "mi.Film") -> "mi.Bitmap.PixelFormat":
