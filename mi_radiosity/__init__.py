@@ -6,7 +6,7 @@ _choose_llvm()  # before anything imports drjit
 
 import mitsuba as _mi
 
-from .core.errors import RadiosityError
+from .core.errors import RadiosityError, RadiosityWarning
 from .core.plugins import welcome_installed as _welcome_installed
 from .display import Shader
 from .display import register as _register
@@ -30,6 +30,7 @@ __all__ = [
     "Pair",
     "Power",
     "RadiosityError",
+    "RadiosityWarning",
     "Shader",
     "Shooting",
     "Solution",

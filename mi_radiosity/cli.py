@@ -13,16 +13,18 @@ from .core.console import (
     PROGRAM,
     Report,
     choose_views,
+    integer,
     loading_arguments,
     positive,
     positive_number,
+    printed_warnings,
     progress_bars,
     shading_argument,
     view_name,
     warn,
 )
 from .core.errors import RadiosityError, interruptible
-from .core.files import check_writable, writing
+from .core.files import check_outputs, writing
 from .evaluation.commands import add_evaluation
 from .export.commands import add_export
 from .export.commands_factors import add_view_factors
@@ -50,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 2 for what the user can mend, 130 after Ctrl-C."""
     try:
         arguments = _parser().parse_args(argv)
-        with interruptible():
+        with interruptible(), printed_warnings():
             _prepare(arguments)
             arguments.command(arguments)
         return 0
@@ -104,7 +106,9 @@ def _render_arguments(parser):
     add("--spp", type=positive, metavar="N", help="camera samples per pixel (default 64)")
     within = "as good as it gets in T seconds, solve and pictures together; the file gets better all the time"
     add("--seconds", type=positive_number, metavar="T", help=within)
-    shading_argument(parser, "gather")
+    shading_argument(parser, None)
+    hides = "are emitters and the sky invisible to the camera? (default: what the scene's integrator says)"
+    add("--hide-emitters", action=argparse.BooleanOptionalAction, default=None, help=hides)
     add("--denoise", action="store_true", help="remove noise; of 4 samples at least (needs mi_radiosity[denoise])")
     add("--save", type=Path, metavar="SOLUTION.npz", help="keep the solution")
     add("--load", type=Path, metavar="SOLUTION.npz", help="show a kept solution instead of solving")
@@ -118,15 +122,15 @@ def _solve_arguments(group):
         metavar="NAME[:PARAMETER]",
         help="ks, mi, gmi, power, uniform or a plugin's, such as gmi:0.75 (default gmi)",
     )
-    add("--alpha", type=float, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
+    add("--alpha", type=positive_number, metavar="A", help="entropic index of gmi, greater than 0 (default 0.5)")
     wanted = "elements wanted, fewer than faces too (default: 19,000 more than the patches, 114,000 at most)"
     add("--elements", type=positive, metavar="N", help=wanted)
-    add("--epsilon", type=float, metavar="E", help="the oracle's threshold, instead of --elements")
+    add("--epsilon", type=positive_number, metavar="E", help="the oracle's threshold, instead of --elements")
     rays = "rays in all that carry power and gather it (default: 300 for each of 19,000 elements, 20 for each of all, "
     rays += "twice as many with lamps like the sun)"
     add("--rays", type=positive, metavar="N", help=rays)
     add("--lines", type=positive, metavar="S", help="random lines per pair (default 10)")
-    add("--seed", type=int, metavar="K", help="random seed (default 0)")
+    add("--seed", type=integer, metavar="K", help="random seed (default 0)")
     layers = "keep the light of every lamp by itself, to dim and colour it later: see view"
     add("--layers", action="store_true", default=None, help=layers)
 
@@ -135,16 +139,19 @@ def _solve_arguments(group):
 
 
 def _render(arguments: argparse.Namespace) -> None:
-    from .display import SHADERS, Shader, require_denoiser, write_image
+    from .display import SHADERS, Shader, require_denoiser, solve_options, unmodelled, write_image
     from .solver import SOLVING_SHARE
 
     options = _solve_options(arguments)
     if arguments.denoise:
         require_denoiser()
-    for path in filter(None, (arguments.output, arguments.save, arguments.stats)):
-        check_writable(path)
+    check_outputs((arguments.output, arguments.save, arguments.stats), (arguments.scene, arguments.load))
     scene = arguments.file.load()
     views = choose_views(scene, arguments.view)
+    warn(unmodelled(scene))
+    named, shading = solve_options(scene)
+    arguments.shading = arguments.shading or shading or "gather"
+    options = _merged(named, options)
     with progress_bars() as report:
         start = time.perf_counter()
         if arguments.seconds and not arguments.load:
@@ -158,8 +165,9 @@ def _render(arguments: argparse.Namespace) -> None:
                 left = max(arguments.seconds - (time.perf_counter() - start), 1e-3) / (len(views) - number)
                 _grow(arguments, solution, view, path, left)
             else:
-                image = solution.render(view, arguments.spp or 64, arguments.shading, denoise=arguments.denoise)
-                write_image(path, image, solution.stats)
+                how = {"denoise": arguments.denoise, "hide_emitters": arguments.hide_emitters}
+                image = solution.render(view, arguments.spp or 64, arguments.shading, **how)
+                write_image(path, image, solution.stats, scene.sensors()[view].film())
             report("render", number + 1, len(views))
     shader: type[Shader] = SHADERS.find(arguments.shading)
     if legend := shader.legend(solution):
@@ -176,21 +184,27 @@ def _grow(arguments: argparse.Namespace, solution: "Solution", view: int, path: 
     from .display import write_image
 
     start, shown, taken, least = time.perf_counter(), 0, 0, 0.0
+    film = solution.model.scene.sensors()[view].film()
 
     def show(image: "Callable[[], mi.TensorXf]", samples: int) -> None:
         nonlocal shown, least, taken
         now, taken = time.perf_counter() - start, samples
         if now >= least:
             before = time.perf_counter()
-            write_image(path, image(), solution.stats | {"spp": samples})
+            write_image(path, image(), solution.stats | {"spp": samples}, film)
             shown, least = samples, now + 20 * (time.perf_counter() - before)
 
     try:
         with interruptible():
             image = solution.render(
-                view, shading=arguments.shading, denoise=arguments.denoise, seconds=seconds, show=show
+                view,
+                shading=arguments.shading,
+                denoise=arguments.denoise,
+                seconds=seconds,
+                show=show,
+                hide_emitters=arguments.hide_emitters,
             )
-        write_image(path, image, solution.stats | {"spp": taken})
+        write_image(path, image, solution.stats | {"spp": taken}, film)
     except KeyboardInterrupt:
         if shown:
             warn([f"interrupted: {path} has {shown} samples per pixel"])
@@ -208,8 +222,16 @@ def _solve_options(arguments: argparse.Namespace) -> dict[str, Any]:
         raise RadiosityError("give either --spp or --seconds, not both")
     if arguments.load and options:
         raise RadiosityError(f"--load shows a finished solution: leave out --{next(iter(options))}")
-    oracle = make_oracle(options.pop("oracle", "gmi"), options.pop("alpha", None))
-    return options | {"oracle": oracle}
+    if {"oracle", "alpha"} & set(options):
+        options["oracle"] = make_oracle(options.pop("oracle", "gmi"), options.pop("alpha", None))
+    return options
+
+
+def _merged(named: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """Options of `solve`: those that the scene's integrator names, and in their place those of the command line."""
+    exclusive = {"elements", "epsilon"}  # `solve` takes one of the two
+    kept = {k: v for k, v in named.items() if k not in exclusive or not exclusive & set(given)}
+    return kept | given
 
 
 def _solution(arguments: argparse.Namespace, scene: "mi.Scene", options: dict[str, Any], report: Report) -> "Solution":
@@ -295,5 +317,5 @@ def _prepare(arguments: argparse.Namespace) -> None:
     path = arguments.scene[0] if isinstance(arguments.scene, list) else arguments.scene
     arguments.file = scene_file(path, arguments.mode, dict(arguments.define), arguments.plugin)
     arguments.file.prepare()
-    if "shading" in arguments:
+    if getattr(arguments, "shading", None) is not None:
         SHADERS.find(arguments.shading)

@@ -134,7 +134,7 @@ def test_radiosity_sees_textures():
         ([[0, 0, 0]], [0, 0, 0], {}, "no normal may be zero"),
         ([[0, 0, 0]] * 3, [[0, 0, 1]] * 2, {}, "do not fit"),
         ([[0, 0]], [0, 0, 1], {}, "shape"),
-        ([[0, 0, 0]], [0, 0, 1], {"samples": 0}, "ask for 1 or more"),
+        ([[0, 0, 0]], [0, 0, 1], {"samples": 0}, "greater than 0"),
     ],
 )
 def test_points_that_cannot_be_measured(box, points, normals, options, says):
@@ -249,7 +249,7 @@ def test_meshio_opens_what_is_written(kept, tmp_path):
         (["--plane", "y=1", "-o", "x.jpg"], ".csv, .vtu or .png"),
         (["--plane", "y=1", "-o", "nowhere/x.csv"], "nowhere does not exist"),
         (["--plane", "y=1", "--spacing", "-1"], "greater than 0"),
-        (["--plane", "y=1", "--samples", "0"], "1 or more"),
+        (["--plane", "y=1", "--samples", "0"], "greater than 0"),
         (["--shape", "sofa"], "no shape 'sofa'"),
         (["--points", "none.csv"], "cannot read none.csv"),
         (["--points", "pyproject.toml"], "no column x"),

@@ -2,12 +2,14 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import RadiosityError
+from .errors import RadiosityError, RadiosityWarning
+from .numbers import real_number, whole_number
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -30,26 +32,52 @@ def warn(messages: Iterable[str]) -> None:
         print(f"{PROGRAM}: warning: {message}", file=sys.stderr)
 
 
+@contextmanager
+def printed_warnings() -> Iterator[None]:
+    """Print every RadiosityWarning of the body on standard error, a line each, as soon as it is issued."""
+    before = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if issubclass(category, RadiosityWarning):
+            warn([str(message)])
+        else:
+            before(message, category, *rest, **more)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", RadiosityWarning)
+        warnings.showwarning = show
+        yield
+
+
 def positive(text: str) -> int:
-    """The whole number > 0 that an option is given."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number greater than 0")
-    return value
+    """The whole number > 0 that an option is given, such as 20000 or 2e4."""
+    return _checked(text, lambda: whole_number("", _number(text)), "a whole number greater than 0")
+
+
+def integer(text: str) -> int:
+    """The whole number that an option is given, such as a seed."""
+    return _checked(text, lambda: whole_number("", _number(text), None), "a whole number")
 
 
 def positive_number(text: str) -> float:
     """The number > 0 that an option is given."""
+    return _checked(text, lambda: real_number("", _number(text), 0), "a number greater than 0")
+
+
+def _number(text):
+    """The int or float that a text stands for: an int where possible, because floats round large numbers."""
     try:
-        value = float(text)
+        return int(text)
     except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number greater than 0")
-    return value
+        return float(text)
+
+
+def _checked(text, convert, wanted):
+    """What ``convert`` returns; the error of an option if the text is not ``wanted``."""
+    try:
+        return convert()
+    except ValueError:  # RadiosityError is one of them
+        raise argparse.ArgumentTypeError(f"'{text}' is not {wanted}") from None
 
 
 def loading_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,9 +110,11 @@ def definition(text: str) -> tuple[str, str]:
     return key, value
 
 
-def shading_argument(parser: argparse.ArgumentParser, default: str = "gouraud") -> None:
-    """Add --shading; its name is checked when plugins have defined theirs."""
-    names = f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default})"
+def shading_argument(parser: argparse.ArgumentParser, default: str | None = "gouraud") -> None:
+    """Add --shading; its name is checked when plugins have defined theirs. default: None if the scene may name it."""
+    names = (
+        f"gather, direct, gouraud, flat, mesh, lux or a plugin's (default {default or 'gather, or the scene says it'})"
+    )
     parser.add_argument("--shading", default=default, metavar="NAME", help=names)
 
 

@@ -1,11 +1,21 @@
 """The errors a user can cause and mend; each message is one line that says what to do."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 class RadiosityError(ValueError):
     """A scene, an option or a file that cannot be used as it is."""
+
+
+class RadiosityWarning(UserWarning):
+    """Something of a scene that a result does not hold; one line that names the shape, sensor or option."""
+
+
+def warn_of(message: str) -> None:
+    """Issue a RadiosityWarning; commands print it on standard error."""
+    warnings.warn(message, RadiosityWarning, stacklevel=3)
 
 
 @contextmanager

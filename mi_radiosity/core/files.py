@@ -2,11 +2,13 @@
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import RadiosityError
+
+MARKED = 2048  # bytes at the beginning of a file that its mark is looked for in
 
 
 @contextmanager
@@ -40,6 +42,46 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     if not os.access(path.parent, os.W_OK | os.X_OK):
         why = "may not be written to" if path.parent.is_dir() else "does not exist"
         raise RadiosityError(f"cannot write {path}: the folder {path.parent} {why}")
+
+
+def check_outputs(
+    outputs: Iterable[str | os.PathLike[str] | None], inputs: Iterable[str | os.PathLike[str] | None] = ()
+) -> None:
+    """Raise RadiosityError now if files could not be written later, if two of them are one, or if one is an input."""
+    taken = [Path(path) for path in inputs if path is not None]
+    kept = len(taken)
+    for path in (Path(path) for path in outputs if path is not None):
+        check_writable(path)
+        if any(same_file(path, other) for other in taken[:kept]):
+            raise RadiosityError(f"cannot write {path}: it is read by this command; choose another name")
+        if any(same_file(path, other) for other in taken[kept:]):
+            raise RadiosityError(f"cannot write {path} twice: give every file a name of its own")
+        taken.append(path)
+
+
+def check_side_file(path: str | os.PathLike[str], mark: bytes, main: Path) -> None:
+    """Raise RadiosityError if ``path``, which goes beside ``main``, cannot be written, or is a file without ``mark``.
+
+    An earlier run has left the mark in the file that it wrote beside ``main``; any other file is not to be overwritten.
+    """
+    path = Path(path)
+    check_writable(path)
+    try:
+        with open(path, "rb") as file:
+            known = mark in file.read(MARKED)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise RadiosityError(
+            f"cannot read {path} ({error.strerror}), which {main} needs: choose another name"
+        ) from None
+    if not known:
+        raise RadiosityError(f"{path} goes beside {main.name}, and is another file: move it, or choose another name")
+
+
+def same_file(a: Path, b: Path) -> bool:
+    """Do two paths name one file, which need not exist?"""
+    return a.resolve() == b.resolve()
 
 
 def _umask():

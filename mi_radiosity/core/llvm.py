@@ -67,15 +67,36 @@ def problem() -> str | None:
     )
 
 
-def require_variant() -> None:
-    """Raise RadiosityError unless the active Mitsuba variant can run our kernels. Every public entry asks."""
+def require_variant(variant: str | None = None) -> None:
+    """Raise RadiosityError unless a Mitsuba variant, the active one by default, can run here.
+
+    Every public function calls this first; commands call it before they choose a variant, because Dr.Jit's own error
+    comes from within `mi.set_variant`.
+    """
     import mitsuba as mi
 
-    variant = mi.variant() or "none"
-    if not variant.startswith(("llvm_", "cuda_")) or "rgb" not in variant:
+    variant = variant or mi.variant() or "none"
+    known = [name for name in mi.variants() if name.startswith(("llvm_", "cuda_")) and name.endswith("_rgb")]
+    if variant not in known:
+        unknown = variant != "none" and variant not in mi.variants()
         raise RadiosityError(
-            f"the Mitsuba variant '{variant}' cannot be used: choose llvm_ad_rgb or cuda_ad_rgb "
+            (f"unknown variant '{variant}'" if unknown else f"the Mitsuba variant '{variant}' cannot be used")
+            + f": choose {' or '.join([name for name in known if not _lacking(name)] or known)} "
             "with mi.set_variant(...) or -m"
         )
-    if variant.startswith("llvm_") and (wrong := problem()):
+    if wrong := _lacking(variant):
         raise RadiosityError(wrong)
+
+
+def _lacking(variant):
+    """One line that says what a variant lacks on this machine and what to do, or None."""
+    import drjit as dr
+
+    if variant.startswith("llvm_"):
+        return problem()
+    if dr.has_backend(dr.JitBackend.CUDA):
+        return None
+    return (
+        f"the Mitsuba variant '{variant}' needs an NVIDIA GPU with its driver, and Dr.Jit found none: "
+        "choose llvm_ad_rgb with mi.set_variant(...) or -m"
+    )

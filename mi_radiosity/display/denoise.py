@@ -12,8 +12,10 @@ from ..core.arrays import lower_bound, opaque_index, owned
 from ..core.color import srgb
 from ..core.errors import RadiosityError
 from ..core.extras import optional
+from .film import has_alpha, on_film
 from .pixels import AT_ONCE, PixelPoints, camera_rays
 
+LEAST_SIDE = 4  # pixels of a film: Open Image Denoise makes the one pixel of a meter 40 % too bright
 FINE = 2  # parts of a pixel along each side, which are denoised one by one
 FEATURE_SPP = 32  # samples per pixel of albedo and normals, which need no more
 APART = 1 << 20  # samples without them that are worth a launch of their own
@@ -56,6 +58,7 @@ class CleanPicture:
     """A picture [height, width, 3] of ``sample(points, ray, met=…)`` that takes more and more samples, denoised; met:
     what rays meet first, as ``see(ray)`` tells, where that is known.
 
+    The channels are those of the sensor's film; alpha, where the film has it, is filtered but not denoised.
     Samples are averaged over quarters of pixels, as the denoiser needs numbers that are independent, with albedo and
     normals of the surfaces seen. The film's own filter is applied afterwards, to quarters, if there are enough samples
     to denoise these: edges are then as smooth as it makes them.
@@ -75,11 +78,16 @@ class CleanPicture:
         film = sensor.film()
         if film.sample_border():
             raise RadiosityError("films that sample their border cannot be denoised: set sample_border to false")
-        self._draw, self._seed, self._rfilter = draw, seed, film.rfilter()
+        if min(film.crop_size()) < LEAST_SIDE:
+            raise RadiosityError(
+                f"a film of {' x '.join(map(str, film.crop_size()))} pixels is too small to be denoised"
+            )
+        self._draw, self._seed, self._film = draw, seed, film
         width, height = (FINE * int(size) for size in film.crop_size())
         # Of every part sums over samples of radiance, of that of one half of them less the other, of albedo and of
         # normals; and how many have the first two, and the others.
         self._sums = [dr.zeros(mi.Color3f, height * width) for _ in range(4)]
+        self._alpha = [dr.zeros(mi.Color3f, height * width)] if has_alpha(film) else []  # its sum, grey
         self._counts = np.zeros((2, height, width), np.int64)
         self._spp, self._spent, self._needed = 0, 0.0, None  # samples per pixel in the mean, and seconds they took
 
@@ -146,20 +154,23 @@ class CleanPicture:
             index += k - start
             dr.eval(part, index, of, done)
             points = self._draw(part, index, of, done, self._seed)
-            planes = self._planes(points, *camera_rays(self._sensor, width, height, part, points), look)
+            planes, valid = self._planes(points, *camera_rays(self._sensor, width, height, part, points), look)
             # Halves take turns in every part, and begin with neighbouring parts: in a pixel they are as many.
             wide = opaque_index(width)
             planes.insert(1, planes[0] * (1 - 2 * mi.Float((part % wide + part // wide + index) & 1)))
-            _add_runs(self._sums, planes, rows, starts, ends)
+            if self._alpha:
+                planes.insert(2, mi.Color3f(dr.select(valid, mi.Float(1), mi.Float(0))))
+            _add_runs([*self._sums[:2], *self._alpha, *self._sums[2:]], planes, rows, starts, ends)
             dr.sync_thread()  # lest launches wait side by side, with all their samples
             if len(parts) == parts[-1] + 1 - parts[0]:
                 parts = slice(parts[0], parts[-1] + 1)  # which is faster
             self._counts.reshape(2, -1)[: 1 + look, parts] += count
 
     def _planes(self, points, ray, weight, look):
-        """Radiance of samples, and if there is a ``look``, albedo and normal (Color3f [n])."""
+        """Radiance of samples, and if there is a ``look``, albedo and normal (Color3f [n]); and did rays hit anything
+        that the picture shows (Bool [n])?"""
         met = self._see(ray) if look else None
-        radiance, _, _ = self._sample(points, ray, met=met)
+        radiance, hit, _ = self._sample(points, ray, met=met)
         planes = [mi.Color3f(radiance * weight)]
         if look:
             si = met.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -167,7 +178,7 @@ class CleanPicture:
             albedo = dr.select(valid, si.bsdf(ray).eval_diffuse_reflectance(si, valid), 0)
             albedo = dr.select(dr.isfinite(albedo), dr.clip(albedo, 0, 1), 1)
             planes += [mi.Color3f(albedo), mi.Color3f(dr.select(valid, normal, 0))]
-        return planes
+        return planes, hit
 
     def _where_needed(self):
         """What samples of pixels (float32 [height, width]) go with, for the sum of errors to be least;
@@ -199,8 +210,7 @@ class CleanPicture:
 
     def _mean(self, k):
         """Mean of what the sums number k are of [height, width, 3]."""
-        count = self._counts[k // 2, ..., None]
-        return np.array(self._sums[k]).T.reshape(*count.shape[:2], 3) / count.astype(np.float32)
+        return _over(self._sums[k], self._counts[k // 2])
 
     def _denoised(self, planes, way):
         """Radiance without its noise, of it with albedo and normals, at the quality of a way."""
@@ -214,7 +224,10 @@ class CleanPicture:
         way = self._way(self._spp, lambda way: self._takes(way) <= most)
         start, planes = time.perf_counter(), [self._mean(k) for k in (0, 2, 3)]
         clean = self._denoised(planes if way.parts > 1 else [_blocks(plane, FINE) for plane in planes], way)
-        image = mi.TensorXf(_filtered(clean, self._rfilter, way.parts))
+        rfilter = self._film.rfilter()
+        alpha = [_filtered(_over(total, self._counts[0]), rfilter, FINE)[..., 0] for total in self._alpha]
+        rgb = _filtered(clean, rfilter, way.parts)
+        image = mi.TensorXf(on_film(rgb, alpha[0] if alpha else None, self._film))
         CleanPicture._pace *= (time.perf_counter() - start) / self._takes(way)
         return image
 
@@ -234,6 +247,11 @@ class CleanPicture:
         """The best way to denoise ``spp`` samples per pixel of those that are allowed, or the cheapest."""
         ways = [way for way in WAYS if allowed(way) and spp >= way.least]
         return (ways or WAYS[:1])[-1]
+
+
+def _over(total, count):
+    """Sums (Color3f) over counts [height, width]: means [height, width, 3]."""
+    return np.array(total).T.reshape(*count.shape, 3) / count[..., None].astype(np.float32)
 
 
 def _add_runs(sums, planes, row, start, end):

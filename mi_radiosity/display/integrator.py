@@ -10,16 +10,29 @@ import mitsuba as mi
 from ..core.arrays import NONE, select
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
+from ..core.numbers import real_number, whole_number
 from ..oracles import make_oracle
 from ..scene import refuse_gradients
 from ..solver import solve
 from ..transport import PathEnd
 from .denoise import CleanPicture
 from .pixels import FilmPicture, grow
+from .scene_integrator import hides_emitters
 from .shaders import SHADERS, Look
 
 LATE = 0.1  # of the time, that may pass beyond it until the last image is as good as planned
+OPTIONS = ("oracle", "alpha", "elements", "epsilon", "rays", "lines", "seed")  # of the plugin, as `solve` has them
 NO_GRADIENTS = "a radiosity solution has no gradients yet: differentiate with 'prb'"
+
+
+def _chosen(scene, sensor):
+    """A sensor, or that of a number in the scene. Raises RadiosityError if there is none."""
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    number, count = whole_number("the number of a sensor", sensor, None), len(scene.sensors())
+    if not 0 <= number < count:
+        raise RadiosityError(f"there is no sensor {number}: the scene has {count}, counted from 0")
+    return scene.sensors()[number]
 
 
 def _integrator_class():
@@ -38,13 +51,21 @@ def _integrator_class():
 
         def __init__(self, props: "mi.Properties") -> None:
             super().__init__(props)
-            self.shading = props.get("shading", "gouraud")
+            self.named_shading = props.get("shading") if "shading" in props else None
+            self.shading = self.named_shading or "gouraud"
             SHADERS.find(self.shading)
-            alpha = float(props.get("alpha")) if "alpha" in props else None
-            self.options: dict[str, Any] = {"oracle": make_oracle(props.get("oracle", "gmi"), alpha)}
-            for name, kind in (("elements", int), ("epsilon", float), ("rays", int), ("lines", int), ("seed", int)):
-                if name in props:
-                    self.options[name] = kind(props.get(name))
+            given = {name: props.get(name) for name in OPTIONS if name in props}
+            self.options: dict[str, Any] = {"oracle": make_oracle(given.pop("oracle", "gmi"), given.pop("alpha", None))}
+            for name, value in given.items():
+                least = None if name == "seed" else 1
+                self.options[name] = (
+                    real_number(name, value, 0) if name == "epsilon" else whole_number(name, value, least)
+                )
+            # What the scene says itself, without defaults: the command line starts from these.
+            self.named = dict(self.options)
+            if "oracle" not in props and "alpha" not in props:
+                del self.named["oracle"]
+            self.hidden = self.hide_emitters
             self.progress = None
             self._forget()
 
@@ -54,9 +75,11 @@ def _integrator_class():
         def _display(self, solution, given):
             self.solution, self._shader, self._given = solution, SHADERS.find(self.shading)(solution), given
 
-        def show(self, solution, shading=None):
-            """Display ``solution`` from now on, in another shading perhaps."""
+        def show(self, solution, shading=None, hide_emitters=None):
+            """Display ``solution`` from now on, in another shading perhaps. hide_emitters: None for what the integrator
+            of the solution's scene says."""
             self.shading = shading or self.shading
+            self.hidden = hides_emitters(solution.model.scene) if hide_emitters is None else bool(hide_emitters)
             self._display(solution, given=True)
 
         def prepare(self, scene):
@@ -75,13 +98,7 @@ def _integrator_class():
         def picture(self, scene, sensor, seed, spp, denoise=False, seconds=None, show=None):
             """What `mi.render` gives, of a sensor or its number; denoised, or as good as ``seconds`` make it, if asked
             for."""
-            if isinstance(sensor, int):
-                count = len(scene.sensors())
-                if not 0 <= sensor < count:
-                    raise RadiosityError(f"there is no sensor {sensor}: the scene has {count}, counted from 0")
-                sensor = scene.sensors()[sensor]
-            if seconds is None and spp < 1:
-                raise RadiosityError(f"spp must be 1 or more, not {spp}")
+            sensor = _chosen(scene, sensor)
             if seconds is None and not denoise:
                 return self.render(scene, sensor, seed=seed, spp=spp)
             start = time.perf_counter()
@@ -101,8 +118,8 @@ def _integrator_class():
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             self.prepare(scene)
-            chosen = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            seed = int(seed[0] if dr.is_array_v(seed) else seed)
+            chosen, spp = _chosen(scene, sensor), whole_number("spp", spp, 0)
+            seed = whole_number("seed", seed[0] if dr.is_array_v(seed) else seed, None)
             picture = FilmPicture(scene, chosen, self._sample, seed)
             picture.add(spp or chosen.sampler().sample_count())
             return picture.image() if develop else None
@@ -119,7 +136,7 @@ def _integrator_class():
 
         def _see(self, ray, active=True):
             """What rays of a camera meet first."""
-            return self.solution.model.rays.seen(ray, active, lamps=not self.hide_emitters)
+            return self.solution.model.rays.seen(ray, active, lamps=not self.hidden)
 
         def _sample(self, sampler, ray, active=True, met=None):
             """What `sample` gives of a scene that is prepared; ``met``: what rays meet first, if that is known."""
@@ -155,7 +172,7 @@ def _integrator_class():
             valid = follows & (~hit.traced | lit | end.passed)
             if not shader.colors:
                 radiance += dr.select(follows, (end.light + glows) * dr.inv_pi, 0)
-            if model.lights.sky_light and not self.hide_emitters:
+            if model.lights.sky_light and not self.hidden:
                 radiance += model.lights.sky(ray.d, active & ~hit.valid) * dr.inv_pi
                 valid |= active
             return radiance, valid, []

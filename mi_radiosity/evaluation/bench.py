@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.points import Stream, stream_seed
-from ..display import SHADERS, CleanPicture
+from ..display import SHADERS, CleanPicture, hides_emitters, linear_rgb
 from ..display.pixels import AT_ONCE
 from ..scene import Model
 from ..solver import SOLVING_SHARE, solve
@@ -184,7 +184,7 @@ def pictures_within(
     for number, sensor in enumerate(sensors):
         left, seen = max(seconds - (now() - start), 1e-3) / (len(sensors) - number), [0]
         picture = solution.render(sensor, shading=shading, denoise=denoise, seconds=left, show=partial(_note, seen))
-        images.append(np.array(picture)[..., :3])
+        images.append(linear_rgb(picture, sensor.film()))
         samples.append(seen[-1])
     return images, more | {"spp": float(np.mean(samples))}
 
@@ -198,7 +198,7 @@ def _solved(scene, shading, elements, rays, sensors):
     start = now()
     solution = solve(scene, elements=elements, rays=rays)
     more = {"elements": solution.stats["elements"], "rays": rays, "solve_seconds": now() - start}
-    return [np.array(solution.render(s, spp=OUR_SPP, shading=shading))[..., :3] for s in sensors], more
+    return [linear_rgb(solution.render(s, spp=OUR_SPP, shading=shading), s.film()) for s in sensors], more
 
 
 def _traced(trace, scene, spp, sensors):
@@ -218,7 +218,7 @@ def _denoiser_is_there() -> bool:
 
 def _denoised_path(scene, sensor, spp):
     """A picture by `path`, denoised as ours are."""
-    integrator = mi.load_dict({"type": "path", "max_depth": -1})
+    integrator = mi.load_dict({"type": "path", "max_depth": -1, "hide_emitters": hides_emitters(scene)})
 
     def draw(pixel, index, total, before, seed):
         sampler = mi.load_dict({"type": "independent"})
@@ -229,7 +229,7 @@ def _denoised_path(scene, sensor, spp):
     see = partial(scene.ray_intersect_preliminary, coherent=True)
     picture = CleanPicture(see, sensor, lambda points, ray, met: integrator.sample(scene, points, ray), spp, draw)
     picture.add(spp)  # all at once, so everywhere alike
-    return np.array(picture.image(picture.finishing(ROOM * (now() - start), spp)))
+    return linear_rgb(picture.image(picture.finishing(ROOM * (now() - start), spp)), sensor.film())
 
 
 def crossing(ours: Sequence[Mapping[str, float]], other: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
@@ -279,14 +279,21 @@ def _turned(sensor: "mi.Sensor", angle: float) -> "mi.Sensor":
     to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
     place, up = to_world[:3, 3], to_world[:3, 1]
     turn = mi.ScalarTransform4f().translate(place).rotate(up, angle).translate(-place)
-    width, height = (max(int(n) // 2, 8) for n in sensor.film().crop_size())
-    film = {"type": "hdrfilm", "width": width, "height": height, "pixel_format": "rgb", "component_format": "float32"}
+    old, values = sensor.film(), dict(mi.traverse(sensor))
+    film: dict[str, Any] = {"type": "hdrfilm", "pixel_format": "rgb", "component_format": "float32"}
+    for axis, length in enumerate(("width", "height")):
+        film[length] = max(int(old.size()[axis]) // 2, 8)
+        film[f"crop_{length}"] = min(max(int(old.crop_size()[axis]) // 2, 8), film[length])
+        offset = int(old.crop_offset()[axis]) // 2
+        film[f"crop_offset_{'xy'[axis]}"] = min(offset, film[length] - film[f"crop_{length}"])
+    offsets = {name: float(values[name][0]) for name in ("principal_point_offset_x", "principal_point_offset_y")}
     return mi.load_dict(
         {
             "type": "perspective",
-            "fov": float(mi.traverse(sensor)["x_fov"][0]),
+            "fov": float(values["x_fov"][0]),
             "fov_axis": "x",
             "to_world": turn @ mi.ScalarTransform4f(to_world),
             "film": film | {"rfilter": {"type": "gaussian"}},
         }
+        | offsets
     )

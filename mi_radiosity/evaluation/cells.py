@@ -10,6 +10,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from ..core.errors import RadiosityError
+from ..display import linear_rgb
 from ..oracles import parse
 from ..solver import Solution, solve
 from .metrics import compare
@@ -76,7 +77,8 @@ def run_cell(cell: Cell) -> tuple[list[Row], Pictures]:
 
 
 def _picture(solution: Solution, view: int, spp: int, shading: str) -> np.ndarray:
-    return np.array(solution.render(view, spp=spp, shading=shading), dtype=np.float32)[..., :3]
+    film = solution.model.scene.sensors()[view].film()
+    return linear_rgb(solution.render(view, spp=spp, shading=shading), film)
 
 
 def _row(cell: Cell, solution: Solution, view: int, image: np.ndarray, halves: np.ndarray) -> Row:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.console import (
     Report,
     choose_views,
+    integer,
     loading_arguments,
     positive,
     positive_number,
@@ -45,7 +46,7 @@ def _reference_arguments(parser):
     add("-o", "--output", required=True, type=Path, metavar="REF.exr", help=names)
     add("--spp", type=positive, default=1024, metavar="N", help="samples per pixel in all (default 1024)")
     add("--view", default="0", metavar="K|all")
-    add("--seed", type=int, default=0, metavar="K")
+    add("--seed", type=integer, default=0, metavar="K")
 
 
 def _budget_arguments(parser, elements, files):

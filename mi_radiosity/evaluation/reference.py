@@ -15,6 +15,8 @@ import OpenEXR
 
 from ..core.errors import RadiosityError
 from ..core.files import writing
+from ..core.numbers import whole_number
+from ..display import hides_emitters, linear_rgb
 from ..scene import Model
 from ..scene.lights import Infinite
 from .metrics import reference_noise
@@ -83,10 +85,12 @@ class Reference:
 def identity(model: Model, sensor: "mi.Sensor", seed: int = 0, depth: int = -1) -> dict[str, Any]:
     """What a reference depends on: scene content, sensor, depth, seed, sampler, versions."""
     place = np.round(np.array(sensor.world_transform().matrix), 5).tolist()
-    view = (sensor.class_name(), place, str(sensor.film()), [str(v) for _, v in mi.traverse(sensor)])
+    view = [sensor.class_name(), place, str(sensor.film()), [str(v) for _, v in mi.traverse(sensor)]]
+    if hides_emitters(model.scene):
+        view.append("hide_emitters")
     return {
         "scene": model.fingerprint,
-        "sensor": hashlib.sha256(repr(view).encode()).hexdigest(),
+        "sensor": hashlib.sha256(repr(tuple(view)).encode()).hexdigest(),
         "depth": depth,
         "seed": seed,
         "sampler": "independent",
@@ -107,21 +111,23 @@ def render_reference(
 
     Passes alternate between the two halves and each is kept as soon as it is done, so a run that was
     stopped goes on where it was, and a finished one can be given more samples. Depth is unlimited,
-    which is what the solver models. Processes may share a file: none undoes what another has done.
+    which is what the solver models. Emitters are hidden where the scene's own integrator hides them.
+    Processes may share a file: none undoes what another has done.
     progress is told samples per pixel.
 
     Raises RadiosityError if the file holds something else, or if Mitsuba would trace the scene wrongly.
     """
+    spp, seed = whole_number("spp", spp), whole_number("seed", seed, None)
     model = scene if isinstance(scene, Model) else Model(scene)
     _require_whole_box(model)
     want = identity(model, sensor, seed)
     width, height = sensor.film().crop_size()
     reference = _kept(path, want) or Reference(want, np.zeros((2, height, width, 3)))
-    each, tracer = pass_size(sensor), _path()
+    each, tracer = pass_size(sensor), _path(hides_emitters(model.scene))
     while sum(reference.spp) < spp or reference.spp[0] != reference.spp[1]:
         half = int(reference.spp[1] < reference.spp[0])
         image = tracer.render(model.scene, sensor, seed=_seed(seed, sum(reference.spp) // each), spp=each)
-        reference.sums[half] += each * np.array(image, dtype=np.float64)[..., :3]
+        reference.sums[half] += each * linear_rgb(image, sensor.film()).astype(np.float64)
         reference.spp[half] += each
         progress(sum(reference.spp), spp)
         if reference.spp[0] == reference.spp[1]:
@@ -185,17 +191,17 @@ def _seed(seed: int, number: int) -> int:
 
 
 def path_image(scene: "mi.Scene", sensor: "mi.Sensor", spp: int, seed: int = 0) -> np.ndarray:
-    """Picture by Mitsuba's `path`, unlimited depth, independent of any reference (float32 [height, width, 3])."""
+    """Linear RGB by Mitsuba's `path`, unlimited depth, independent of any reference (float32 [height, width, 3])."""
     image: Any = 0.0
-    done, tracer = 0, _path()
+    done, tracer = 0, _path(hides_emitters(scene))
     while done < spp:
         count = min(pass_size(sensor), spp - done)
         part = tracer.render(scene, sensor, seed=_seed(seed + 0xB5, done), spp=count)
-        image, done = image + count * np.array(part)[..., :3], done + count
+        image, done = image + count * linear_rgb(part, sensor.film()), done + count
     return np.asarray(image / done, dtype=np.float32)
 
 
-def _path() -> Any:
+def _path(hide_emitters: bool) -> Any:
     """Mitsuba's `path` with independent samples, whatever sampler the scene names.
 
     Its stratified sampler is biased: with 4 samples per pixel the office is 37 % too bright in the
@@ -206,7 +212,7 @@ def _path() -> Any:
     class Path(ADIntegrator):
         def __init__(self):
             super().__init__(mi.Properties())
-            self.path = mi.load_dict({"type": "path", "max_depth": -1})
+            self.path = mi.load_dict({"type": "path", "max_depth": -1, "hide_emitters": hide_emitters})
 
         def prepare(self, sensor, seed, spp, aovs):
             sampler = mi.load_dict({"type": "independent", "sample_count": spp})

@@ -1,6 +1,7 @@
 """A scene file as any process loads it."""
 
 import functools
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
 from ..core.plugins import load, load_installed
 from ..scene import Model
+
+MAX_REASON = 600  # characters of Mitsuba's own message: files that include one another make it as long as their depth
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,9 @@ class SceneFile:
 
         Raises RadiosityError if the variant cannot be used or a plugin fails.
         """
-        if self.variant not in mi.variants():
-            raise RadiosityError(f"unknown variant '{self.variant}': choose one of {', '.join(mi.variants())}")
+        require_variant(self.variant)
         if mi.variant() != self.variant:
             mi.set_variant(self.variant)
-        require_variant()
         _run_plugins(self.plugins)
 
     def load(self, optimize: bool = False) -> "mi.Scene":
@@ -42,12 +43,13 @@ class SceneFile:
         """
         self.prepare()
         if not Path(self.path).is_file():
-            raise RadiosityError(f"the scene {self.path} does not exist: check the path")
+            why = "is a folder: name a file" if Path(self.path).is_dir() else "does not exist: check the path"
+            raise RadiosityError(f"the scene {self.path} {why}")
         definitions: dict[str, Any] = dict(self.definitions)
         try:
             scene = mi.load_file(self.path, optimize=optimize, **definitions)
-        except RuntimeError as error:
-            raise RadiosityError(f"Mitsuba cannot read {self.path}: {error}") from None
+        except Exception as error:  # of Mitsuba, and of plugins written in Python
+            raise RadiosityError(f"Mitsuba cannot read {self.path}: {_reason(str(error))}") from None
         if not isinstance(scene, mi.Scene):
             raise RadiosityError(f"{self.path} holds no <scene>: give a scene file")
         return scene
@@ -72,6 +74,18 @@ def scene_file(
         tuple(sorted(dict(definitions or {}).items())),
         tuple(str(Path(name).resolve()) if name.endswith(".py") else name for name in plugins),
     )
+
+
+def _reason(text):
+    """What Mitsuba says is wrong: without its source lines, without the traceback of a Python plugin, and not longer
+    than MAX_REASON."""
+    text = re.sub(r"\[\w+\.cpp:\d+\] ", "", text)
+    if "Traceback (most recent call last)" in text:
+        before, trace = text.split("Traceback (most recent call last)", 1)
+        errors = re.findall(r"^(?:[\w.]+\.)?(\w+(?:Error|Exception): .*)$", trace, flags=re.MULTILINE)
+        text = before + (errors[-1].removeprefix("RadiosityError: ") if errors else trace)
+    text = " ".join(text.split())
+    return text if len(text) <= MAX_REASON else f"{text[: MAX_REASON // 3]} … {text[-MAX_REASON * 2 // 3 :]}"
 
 
 @functools.lru_cache(maxsize=2)

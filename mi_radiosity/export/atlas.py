@@ -225,12 +225,12 @@ def on_surface(model: Model, atlas: Atlas, piece: np.ndarray, weight: np.ndarray
 
 def reflectance(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """ρ at points of patches [n, 3]."""
-    face, back = face_of(model, patch), is_back(model, patch)
-    u, v = (owned(mi.Float, x) for x in uv.T)
-    rho = model.materials.reflectance_at(owned(mi.UInt32, face), u, v, owned(mi.UInt32, back) == 1)
+    rho = model.reflectance_at(owned(mi.UInt32, patch), *(owned(mi.Float, x) for x in uv.T))
     return np.array(rho, dtype=np.float64).reshape(3, -1).T
 
 
-def emission(model: Model, patch: np.ndarray) -> np.ndarray:
-    """E of patches, W/m² [n, 3]."""
-    return np.array(dr.gather(mi.Color3f, model.patches.emission, owned(mi.UInt32, patch))).reshape(3, -1).T
+def emission(model: Model, patch: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """E at points of patches, with the textures of emitters, W/m² [n, 3]."""
+    u, v = (owned(mi.Float, x) for x in uv.T)
+    every = dr.full(mi.Bool, True, len(patch))
+    return np.array(model.lights.at(model.patches, owned(mi.UInt32, patch), u, v, every)).reshape(3, -1).T

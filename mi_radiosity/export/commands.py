@@ -7,7 +7,7 @@ from typing import Any
 
 from ..core.console import progress_bars
 from ..core.errors import RadiosityError
-from ..core.files import check_writable
+from ..core.files import check_outputs
 from .commands_lightmap import bake, lightmap_arguments, refuse_without_lightmap
 from .kept import load_kept
 
@@ -27,6 +27,8 @@ def add_export(commands: Any, solution_arguments: Callable[[argparse.ArgumentPar
         solution_arguments(parser)
         add("-o", "--output", required=True, type=Path, metavar=files)
         add("--exposure", default="1", metavar="X|auto", help="what radiance is multiplied by for colours (default 1)")
+        hides = "leave emitters out? (default: what the scene's integrator says)"
+        add("--hide-emitters", action=argparse.BooleanOptionalAction, default=None, help=hides)
         if run is _export:
             lightmap_arguments(parser)
         parser.set_defaults(command=run)
@@ -37,6 +39,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from .tone import checked
 
     checked(arguments.exposure, arguments.output)
+    check_outputs((arguments.output,), (arguments.scene, arguments.solution))
     if arguments.lightmap is not None:
         bake(arguments)
         return
@@ -44,8 +47,9 @@ def _export(arguments: argparse.Namespace) -> None:
     check_target(arguments.output)
     solution = load_kept(arguments)
     with progress_bars() as report:
-        export(solution, arguments.output, arguments.exposure, report)
-    print(arguments.output)
+        written = export(solution, arguments.output, arguments.exposure, report, arguments.hide_emitters)
+    for path in written:
+        print(path)
 
 
 def _view(arguments: argparse.Namespace) -> None:
@@ -55,8 +59,8 @@ def _view(arguments: argparse.Namespace) -> None:
     if arguments.output.suffix.lower() not in (".html", ".htm"):
         raise RadiosityError(f"-o {arguments.output}: choose a name that ends in .html")
     checked(arguments.exposure)
-    check_writable(arguments.output)
+    check_outputs((arguments.output,), (arguments.scene, arguments.solution))
     solution = load_kept(arguments)
     with progress_bars() as report:
-        write_page(solution, arguments.output, arguments.exposure, report)
+        write_page(solution, arguments.output, arguments.exposure, report, arguments.hide_emitters)
     print(arguments.output)

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core.console import progress_bars, warn
+from ..core.console import integer, positive, progress_bars, warn
 from ..core.errors import RadiosityError
+from ..core.files import check_outputs
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -19,9 +20,9 @@ def add_view_factors(commands: Any, scene_arguments: Callable[[argparse.Argument
     files = "sparse matrix; beside .csv and .mtx, OUT_facets.csv names the facets"
     add("-o", "--output", required=True, type=Path, metavar="OUT.npz|.csv|.mtx", help=files)
     add("--level", default="face", metavar="shape|face", help="what has a row: shapes, or their faces (default face)")
-    add("--rays", type=int, metavar="N", help="rays from every row (default 1,024; 131,072 from shapes)")
+    add("--rays", type=positive, metavar="N", help="rays from every row (default 1,024; 131,072 from shapes)")
     add("--up", default="z", metavar="x|y|z", help="axis towards the sky (default z); -x, -y, -z as --up=-z")
-    add("--seed", type=int, default=0, metavar="K", help="random seed (default 0)")
+    add("--seed", type=integer, default=0, metavar="K", help="random seed (default 0)")
     parser.set_defaults(command=_view_factors)
 
 
@@ -29,9 +30,10 @@ def _view_factors(arguments: argparse.Namespace) -> None:
     """Compute, write, and print what closing has changed."""
     from ..scene import Model
     from ..transport import view_factors
-    from .factors import check_factors_path, write_factors
+    from .factors import check_factors_path, facets_path, write_factors
 
     check_factors_path(arguments.output)
+    check_outputs((arguments.output, facets_path(arguments.output)), (arguments.scene,))
     up = _up(arguments.up)
     model = Model(arguments.file.load(), lit=False)
     warn(model.warnings)

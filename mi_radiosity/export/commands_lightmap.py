@@ -2,7 +2,7 @@
 
 import argparse
 
-from ..core.console import progress_bars
+from ..core.console import integer, positive, progress_bars
 from ..core.errors import RadiosityError
 from .kept import load_kept
 
@@ -12,12 +12,17 @@ SAMPLES = 256  # per texel
 def lightmap_arguments(parser: argparse.ArgumentParser) -> None:
     """What is asked for of a lightmap."""
     add = parser.add_argument_group("lightmap").add_argument
-    add("--lightmap", type=int, metavar="SIZE", help="bake SIZE x SIZE texels: irradiance (.exr) or the scene (.glb)")
+    add(
+        "--lightmap",
+        type=integer,
+        metavar="SIZE",
+        help="bake SIZE x SIZE texels: irradiance (.exr) or the scene (.glb)",
+    )
     samples = f"lines to the lamps, and as many rays into the room, per texel (default {SAMPLES})"
-    add("--samples", type=int, metavar="N", help=samples)
+    add("--samples", type=positive, metavar="N", help=samples)
     add("--denoise", action="store_true", help="by Open Image Denoise")
     add("--unlit", action="store_true", help="a .glb that every viewer shows, its texture being the radiance itself")
-    add("--seed", type=int, metavar="K", help="random seed (default 0)")
+    add("--seed", type=integer, metavar="K", help="random seed (default 0)")
 
 
 def refuse_without_lightmap(arguments: argparse.Namespace) -> None:
@@ -48,6 +53,7 @@ def bake(arguments: argparse.Namespace) -> None:
             arguments.exposure,
             arguments.seed or 0,
             report,
+            arguments.hide_emitters,
         )
     mean, error = found.mean(), found.error[found.open].mean() / max(found.irradiance[found.open].mean(), 1e-30)
     print(

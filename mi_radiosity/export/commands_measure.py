@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..core.console import progress_bars
+from ..core.console import integer, positive, positive_number, progress_bars
 from ..core.errors import RadiosityError
-from ..core.files import check_writable
+from ..core.files import check_outputs
 from .kept import load_kept
 
 SAMPLES = 1024  # per point
@@ -26,11 +26,13 @@ def _arguments(parser):
     where.add_argument("--points", type=Path, metavar="FILE.csv", help="points with normals: x,y,z,nx,ny,nz")
     where.add_argument("--plane", metavar="z=0.8", help="a plane that faces +z, or -z=0.8 for one that faces -z")
     where.add_argument("--shape", metavar="NAME", help="the surfaces of a shape")
-    add("--spacing", type=float, metavar="M", help="between points of a plane or shape (default: 20 along it)")
+    add(
+        "--spacing", type=positive_number, metavar="M", help="between points of a plane or shape (default: 20 along it)"
+    )
     add("--lux", action="store_true", help="illuminance in lx instead of W/m² per channel")
     samples = f"lines to the lamps, and as many rays into the room, per point (default {SAMPLES})"
-    add("--samples", type=int, default=SAMPLES, metavar="N", help=samples)
-    add("--seed", type=int, default=0, metavar="K", help="random seed (default 0)")
+    add("--samples", type=positive, default=SAMPLES, metavar="N", help=samples)
+    add("--seed", type=integer, default=0, metavar="K", help="random seed (default 0)")
     add("-o", "--output", type=Path, metavar="OUT.csv|.vtu|.png", help="numbers, a mesh, or a picture in false colours")
 
 
@@ -39,10 +41,8 @@ def _measure(arguments: argparse.Namespace) -> None:
     from .grids import file_grid, plane_grid, shape_grid
     from .measure import check_output, measure, write_measurement
 
-    if arguments.samples < 1:
-        raise RadiosityError(f"--samples {arguments.samples}: ask for 1 or more")
     if arguments.output:
-        check_writable(arguments.output)
+        check_outputs((arguments.output,), (arguments.scene, arguments.solution, arguments.points))
         check_output(arguments.output, arguments.points is None)
     if arguments.points and arguments.spacing is not None:
         raise RadiosityError("--spacing belongs to --plane and --shape: points of a file are where they are")

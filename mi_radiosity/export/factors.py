@@ -11,19 +11,22 @@ import numpy as np
 
 from ..core.errors import RadiosityError
 from ..core.extras import optional
-from ..core.files import check_writable, writing
+from ..core.files import check_side_file, check_writable, writing
 from ..transport import Closure, ViewFactors
 
 SUFFIXES = (".npz", ".csv", ".mtx")
+FACETS = ("number", "name", "area")  # columns of the table of facets
 LINES = 1 << 18  # of a table written at a time
 
 
 def check_factors_path(path: str | os.PathLike[str]) -> None:
-    """Raise RadiosityError now if view factors could not be written to ``path``."""
+    """Raise RadiosityError now if view factors could not be written to ``path``, or if the table beside that would
+    overwrite another file."""
     if Path(path).suffix.lower() not in SUFFIXES:
         raise RadiosityError(f"{path}: choose a name that ends in .npz, .csv or .mtx")
-    for file in (Path(path), facets_path(path)):
-        check_writable(file)
+    check_writable(path)
+    if Path(path).suffix.lower() != ".npz":
+        check_side_file(facets_path(path), ",".join(FACETS).encode(), Path(path))
 
 
 def facets_path(path: str | os.PathLike[str]) -> Path:
@@ -47,7 +50,7 @@ def write_factors(
     if suffix != ".npz":
         with writing(facets_path(path)) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
             table = csv.writer(file)
-            table.writerow(["number", "name", "area"])
+            table.writerow(FACETS)
             areas = [*map(float, factors.areas), *[""] * (len(factors.names) - len(factors.areas))]
             table.writerows(zip(range(len(factors.names)), factors.names, areas))
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..core.arrays import owned
 from ..mesh.subdivision import NODES
 from ..scene import Model
-from ..scene.materials import is_diffuse, is_textured
+from ..scene.materials import is_diffuse, is_textured, varies_over_uv
 from ..scene.tessellate import Part
 from ..solver import Solution
 from ..solver.field import Field
@@ -26,16 +26,17 @@ class LitMesh:
 
     A leaf is one triangle, or is cut at the vertices that hang on its sides, so that triangles of one surface meet
     along whole sides. Vertices are shared within a side of a shape, where they share a shading normal, a texture's
-    coordinates and, beside walls, their light. Triangles are counter-clockwise as seen from the side that is lit.
+    coordinates or a colour of vertices and, beside walls, their light. Triangles are counter-clockwise as seen from the
+    side that is lit.
     """
 
     vertices: np.ndarray  # [vertices, 3] m, in the coordinates of the scene
     triangles: np.ndarray  # [triangles, 3] numbers of vertices
     direct: np.ndarray  # [vertices, 3] irradiance from the lamps' first flight, W/m²
     indirect: np.ndarray  # [vertices, 3] from all later ones
-    reflectance: np.ndarray  # [vertices, 3] ρ, the mean over the leaves around
+    reflectance: np.ndarray  # [vertices, 3] ρ, the mean over the leaves around; of colours of vertices and faces ρ here
     emission: np.ndarray  # [vertices, 3] E, W/m²
-    uv: np.ndarray  # [vertices, 2] coordinates of the shape's texture, NaN where it has none
+    uv: np.ndarray  # [vertices, 2] coordinates of the shape's texture, NaN where it has none over (u, v)
     leaf: np.ndarray  # [triangles] number of the leaf among the leaves of the solution, −1 where no light comes
     shape: np.ndarray  # [triangles] number of the shape among the parts of the scene, model.faces.parts
     back: np.ndarray  # [triangles] bool: the back of the shape
@@ -138,20 +139,27 @@ def _lit(solution, by_lamp):
     face, back = np.array(model.patches.face)[patch], np.array(model.patches.back).astype(bool)[patch]
     shape = model.faces.shape[face]
     uv = _texture_coordinates(model, face, table[pieces, :3])
+    colors = _colors(model, face, back, table[pieces, :3])
     own = beside[:, None] & (np.abs(values - table[pieces, 3:]) > APART * (values + mean)).any(axis=2)
     step = np.round(np.log(values + mean / 100) / APART).astype(np.int64)
     apart = np.where(own[..., None], step, np.iinfo(np.int64).max).reshape(len(own) * 3, -1)
     key = [pieces.ravel(), np.repeat(2 * shape + back, 3), *apart.T, *_rounded(uv)]
+    if colors is not None:
+        key += _rounded(colors, 2**12)
     first, number = _unique(key)
     number, values = number.reshape(-1, 3), values.reshape(len(own) * 3, -1, 2, 3)[first]
     turned = (back ^ model.faces.flipped[face])[:, None]
     rho, emission = _rows(elements.reflectance)[leaves[of]], _rows(elements.emission(elements.leaves))[of]
+    reflectance = _around(number, rho, len(first))
+    if colors is not None:
+        colors = colors.reshape(-1, 3)[first]
+        reflectance = np.where(np.isnan(colors), reflectance, colors)
     return LitMesh(
         vertices=table[pieces.ravel()[first], :3],
         triangles=np.where(turned, number[:, ::-1], number),
         direct=values[:, 0, 1],
         indirect=values[:, 0, 0] - values[:, 0, 1],
-        reflectance=_around(number, rho, len(first)),
+        reflectance=reflectance,
         emission=_around(number, emission, len(first)),
         uv=uv.reshape(-1, 2)[first],
         leaf=of,
@@ -203,16 +211,36 @@ def _around(triangles, values, count):
 
 
 def _texture_coordinates(model, face, points):
-    """UV of the corners of pieces of faces, where their shapes are textured [pieces, 3, 2]."""
+    """UV of the corners of pieces of faces, where their shapes have textures over (u, v) [pieces, 3, 2]."""
     faces, uv = model.faces, np.full((len(face), 3, 2), np.nan)
-    textured = [is_textured(p.shape.bsdf()) and is_diffuse(p.shape.bsdf()) for p in faces.parts]
+    textured = [varies_over_uv(p.shape.bsdf()) and is_diffuse(p.shape.bsdf()) for p in faces.parts]
     for number in np.flatnonzero(textured):
         chosen = np.flatnonzero(faces.shape[face] == number)
-        of = np.repeat(face[chosen], 3)
-        u, v = barycentric(faces.corners[of], points[chosen].reshape(-1, 3))
-        si = faces.surface(*(owned(kind, x) for kind, x in ((mi.UInt32, of), (mi.Float, u), (mi.Float, v))))
+        si = faces.surface(*_on_faces(faces, face[chosen], points[chosen]))
         uv[chosen] = np.array(si.uv).T.reshape(-1, 3, 2)
     return uv
+
+
+def _colors(model, face, back, points):
+    """ρ at the corners of pieces of faces, where it varies with more than (u, v), as colours of vertices and faces do
+    [pieces, 3, 3]; NaN elsewhere, and None if that is everywhere."""
+    faces, bsdfs = model.faces, [part.shape.bsdf() for part in model.faces.parts]
+    varied = np.array([is_diffuse(b) and is_textured(b) and not varies_over_uv(b) for b in bsdfs])
+    chosen = np.flatnonzero(varied[faces.shape[face]])
+    if not len(chosen):
+        return None
+    colors = np.full((len(face), 3, 3), np.nan)
+    behind = owned(mi.UInt32, np.repeat(back[chosen], 3)) == 1
+    rho = model.materials.reflectance_at(*_on_faces(faces, face[chosen], points[chosen]), behind)
+    colors[chosen] = np.array(rho, dtype=np.float64).reshape(3, -1).T.reshape(-1, 3, 3)
+    return colors
+
+
+def _on_faces(faces, face, points):
+    """Faces and barycentric coordinates of points on them [pieces, 3, 3] (UInt32, Float, Float [3 pieces])."""
+    of = np.repeat(face, 3)
+    u, v = barycentric(faces.corners[of], points.reshape(-1, 3))
+    return owned(mi.UInt32, of), owned(mi.Float, u), owned(mi.Float, v)
 
 
 def barycentric(corners: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -234,8 +262,9 @@ def _unique(columns):
     return np.sort(first), number
 
 
-def _rounded(uv):
-    return list(np.round(np.nan_to_num(uv) * 2**16).astype(np.int64).reshape(-1, 2).T)
+def _rounded(values, steps=2**16):
+    """Columns of values [..., k] in so many steps per unit, 0 for NaN."""
+    return list(np.round(np.nan_to_num(values) * steps).astype(np.int64).reshape(-1, values.shape[-1]).T)
 
 
 def _rows(color):

@@ -62,7 +62,7 @@ class GltfFile:
     def add_cameras(self, scene: "mi.Scene") -> None:
         """A node for each perspective sensor."""
         for camera in cameras(scene):
-            width, height = camera.size
+            width, height = camera.film.size
             view = self.lib.Perspective(
                 aspectRatio=width / height, yfov=float(np.radians(camera.y_fov)), znear=camera.near, zfar=camera.far
             )

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import RadiosityError
+from ..core.numbers import real_number
 from ..scene import Model
 from ..scene.overlap import EDGE, surfaces
 
@@ -179,9 +180,7 @@ def _cells(length, step):
 def _checked_spacing(spacing, longest):
     if spacing is None:
         return longest / CELLS
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise RadiosityError(f"a spacing of {spacing} m is impossible: make it greater than 0")
-    return spacing
+    return real_number("spacing", spacing, 0)
 
 
 def _checked_count(count):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..core.errors import RadiosityError
 from ..core.extras import optional
+from ..core.numbers import whole_number
 from ..solver import Solution
 from .atlas import SPOTS, Atlas, emission, on_surface, reflectance, spots, unwrap, whole
 from .dividing import cut_at_walls
@@ -62,7 +63,11 @@ def lightmap(
     called with ("unwrap" | "gather", done, total).
     Raises RadiosityError for a size that is impossible or too small, and if a library is missing.
     """
-    check_budget(size, samples, denoise)
+    size, samples, seed = (
+        check_budget(size, samples, denoise),
+        whole_number("samples", samples),
+        whole_number("seed", seed, None),
+    )
     progress("unwrap", 0, 1)
     atlas = unwrap(solution.model, whole(solution.model), size)
     where = spots(atlas)
@@ -75,16 +80,17 @@ def lightmap(
     return replace(texels, irradiance=level_seams(solution.model, atlas, light, texels.open))
 
 
-def check_budget(size: int, samples: int, denoise: bool = False) -> None:
-    """Raise RadiosityError for a lightmap that could not be baked."""
+def check_budget(size: int, samples: int, denoise: bool = False) -> int:
+    """The size of a lightmap as a Python int. Raises RadiosityError for a lightmap that could not be baked."""
+    size = whole_number("the size of a lightmap", size, None)
     if not LEAST <= size <= MOST:
         raise RadiosityError(f"a lightmap of {size} x {size} texels is impossible: choose {LEAST} to {MOST}")
-    if samples < 1:
-        raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+    whole_number("samples", samples)
     for module in ("xatlas", "scipy"):
         optional(module, "a lightmap", "export")
     if denoise:
         optional("mitsuba_oidn", "denoising", "denoise")
+    return size
 
 
 def _gather(solution, atlas, where, samples, seed, progress):
@@ -106,7 +112,7 @@ def _gather(solution, atlas, where, samples, seed, progress):
     deviation = np.sqrt((error**2).reshape(n, k, 3).sum(axis=1)) / np.maximum(count, 1)
     rho = reflectance(model, patch, uv).reshape(n, k, 3).mean(axis=1)
     area = (atlas.texel_area(model)[where.piece] * (valid.reshape(n, k) & where.inside)).mean(axis=1)
-    E = emission(model, patch).reshape(n, k, 3).mean(axis=1)
+    E = emission(model, patch, uv).reshape(n, k, 3).mean(axis=1)
 
     def image(values, kind=np.float64):
         out = np.zeros((atlas.size**2, *np.shape(values)[1:]), dtype=kind)

@@ -16,9 +16,11 @@ from ..scene import Model
 from ..scene.materials import is_textured
 from ..solver import Solution
 from .atlas import face_of, is_back
+from .cameras import warn_of_lost_cameras
 from .geometry import RAISE, dark_faces, name_of, sides_below
 from .gltf import FLOAT, INDICES, INT, GltfFile
 from .lightmap import SAMPLES, Lightmap, lightmap
+from .shown import hidden_parts, warn_of_losses
 from .textures import png, png8
 from .tone import BRIGHT, checked
 
@@ -38,11 +40,13 @@ def export_lightmap(
     exposure: float | str = 1.0,
     seed: int = 0,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
+    hide_emitters: bool | None = None,
 ) -> Lightmap:
     """Bake a lightmap of size × size texels and write it: .exr for irradiance, W/m², or .glb for the scene with it.
 
     unlit: a scene whose texture is exposure × radiance, which every viewer shows, instead of one whose materials have
     the light as `MOZ_lightmap`. exposure: a number, or "auto". samples, denoise, progress: see `lightmap`.
+    hide_emitters: leave emitters out of the scene; by default as the scene's own integrator says.
     Raises RadiosityError for another name, for a file that cannot be written, and for an exposure of irradiance (.exr).
     """
     path = Path(path)
@@ -52,7 +56,11 @@ def export_lightmap(
     if path.suffix.lower() == ".exr":
         write_image(path, mi.TensorXf(found.irradiance.astype(np.float32)))
         return found
-    file = _scene_file(solution.model, found, unlit, _exposure(found, exposure))
+    model = solution.model
+    hidden = hidden_parts(model, hide_emitters)
+    warn_of_losses(model, set(range(len(model.faces.parts))) - set(hidden), textures=True)
+    warn_of_lost_cameras(model.scene, "glTF")
+    file = _scene_file(model, found, unlit, _exposure(found, exposure), hidden)
     with writing(path) as temporary:
         file.save(temporary)
     return found
@@ -86,7 +94,7 @@ def _brightest(found, values, share, which=True):
     return float(most[order[np.searchsorted(below, share * below[-1])]])
 
 
-def _scene_file(model: Model, found: Lightmap, unlit: bool, exposure: float) -> GltfFile:
+def _scene_file(model: Model, found: Lightmap, unlit: bool, exposure: float, hidden: list[int]) -> GltfFile:
     file = GltfFile(model.scene)
     light, scale = _picture(found, unlit, exposure)
     texture = file.add_texture(light, mipmaps=False)
@@ -97,7 +105,7 @@ def _scene_file(model: Model, found: Lightmap, unlit: bool, exposure: float) -> 
         materials = _lit_materials(file, texture, model, found, scale * exposure, exposure)
     patch, face, points, normals, place = _triangles(model, found)
     shape = model.faces.shape[face]
-    for number in np.unique(shape).tolist():
+    for number in np.setdiff1d(shape, hidden).tolist():
         name, part, primitives = name_of(model.faces.parts, number), np.flatnonzero(shape == number), []
         for which, material in materials(number, name, patch[part]):
             chosen = part[which]

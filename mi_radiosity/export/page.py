@@ -15,10 +15,12 @@ import numpy as np
 
 from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.files import check_writable, writing
+from ..core.numbers import whole_number
 from ..solver import Solution
 from ..solver.layers import Layers
-from .cameras import cameras, up
+from .cameras import cameras, up, warn_of_lost_cameras
 from .geometry import RAISE, LitMesh, lit_mesh, name_of
+from .shown import hidden_parts, warn_of_losses, without
 from .textures import png, textures
 from .tone import checked, exposure_of
 
@@ -33,14 +35,17 @@ def write_page(
     path: str | os.PathLike[str],
     exposure: float | str = 1.0,
     progress: Report | None = None,
+    hide_emitters: bool | None = None,
 ) -> None:
     """Write the page; it needs no network and no other file.
 
     exposure: what radiance is multiplied by at first, a number or "auto". progress: called with ("view", done, total).
+    hide_emitters: leave emitters out; by default as the scene's own integrator says. Issues a RadiosityWarning for
+    everything that the page leaves out.
     Raises RadiosityError if the file cannot be written.
     """
     check_writable(path)
-    text = page(solution, exposure, progress)
+    text = page(solution, exposure, progress, hide_emitters)
     with writing(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(text)
 
@@ -59,15 +64,23 @@ class Frame:
 
 def view(solution: Solution, exposure: float | str = 1.0, height: int = 480) -> Frame:
     """The page within a notebook, as many pixels high."""
-    return Frame(page(solution, exposure), int(height))
+    return Frame(page(solution, exposure), whole_number("height", height))
 
 
-def page(solution: Solution, exposure: float | str = 1.0, progress: Report | None = None) -> str:
+def page(
+    solution: Solution,
+    exposure: float | str = 1.0,
+    progress: Report | None = None,
+    hide_emitters: bool | None = None,
+) -> str:
     """The text of the page."""
     report = progress or (lambda stage, done, total: None)
     exposure = checked(exposure)
     report("view", 0, 2)
-    mesh = shown = lit_mesh(solution) if solution.layers is None else lit_mesh(solution.relight({}), by_lamp=True)
+    mesh = lit_mesh(solution) if solution.layers is None else lit_mesh(solution.relight({}), by_lamp=True)
+    mesh = shown = without(mesh, hidden_parts(solution.model, hide_emitters))
+    warn_of_losses(solution.model, mesh.shape.tolist(), textures=True)
+    warn_of_lost_cameras(solution.model.scene, "the page")
     if solution.layers:
         shown = _dimmed(mesh, solution.layers)
     report("view", 1, 2)

@@ -1,6 +1,7 @@
 """Stanford PLY, binary: colours for viewers, and the light itself."""
 
 import os
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,8 +12,10 @@ from .geometry import LitMesh
 LIGHT = ("irradiance", "radiosity")
 
 
-def write_ply(mesh: LitMesh, path: str | os.PathLike[str], exposure: float | None = 1.0) -> None:
-    """Write the mesh.
+def write_ply(
+    mesh: LitMesh, path: str | os.PathLike[str], exposure: float | None = 1.0, comments: Sequence[str] = ()
+) -> None:
+    """Write the mesh; ``comments`` become lines of the header.
 
     Vertices have ``irradiance_r/g/b`` and ``radiosity_r/g/b``, W/m², and ``red, green, blue``: sRGB of the radiance
     times ``exposure``, left out if that is None. Faces have the numbers of their leaf and shape.
@@ -31,6 +34,7 @@ def write_ply(mesh: LitMesh, path: str | os.PathLike[str], exposure: float | Non
         "ply",
         "format binary_little_endian 1.0",
         "comment irradiance and radiosity in W/m^2",
+        *(f"comment {line}" for line in comments),
         f"element vertex {len(vertex)}",
         *(f"property {'float' if vertex.dtype[name] == '<f4' else 'uchar'} {name}" for name in vertex.dtype.names),
         f"element face {len(face)}",

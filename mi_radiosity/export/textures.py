@@ -8,10 +8,13 @@ import numpy as np
 
 from ..core.arrays import owned
 from ..core.color import srgb8
-from ..scene.tessellate import Part
+from ..core.errors import warn_of
+from ..scene.tessellate import Part, children
 from .geometry import LitMesh
 
 FEWEST, MOST = 512, 2048  # pixels along a side
+FLAT = 1e-3  # extent of a texture along a coordinate that is the same all over a shape
+CELL = 16  # pixels along a cell of a checkerboard, so that its edges are sharp
 CELLS = 2, 4  # along a side of a pixel that is the mean of many points: at least, at most
 POINTS = 1 << 22  # of a picture, beyond which pixels have as few cells as they may: bounds the work
 
@@ -49,13 +52,18 @@ def textures(mesh: LitMesh, parts: list[Part]) -> dict[tuple[int, bool], Texture
         part = textured & (mesh.shape == shape) & (mesh.back == back)
         uv = mesh.uv[np.unique(mesh.triangles[part])]
         low, high = uv.min(axis=0), uv.max(axis=0)
-        if (high > low).all():
-            found[shape, back] = _bake(parts[shape].shape.bsdf(), back, low, high)
+        high = np.where(high > low, high, low + FLAT)
+        found[shape, back] = _bake(parts[shape], back, low, high)
     return found
 
 
-def _bake(bsdf, back, low, high):
-    size, sharp = _resolution(bsdf, high - low)
+def _bake(part, back, low, high):
+    bsdf, wanted = part.shape.bsdf(), np.ceil(_density(part.shape.bsdf()) * (high - low))
+    size = tuple(int(n) for n in np.clip(wanted, FEWEST, MOST))
+    sharp = bool((wanted <= MOST).all())
+    if not sharp:
+        need = " x ".join(f"{n:,.0f}" for n in wanted)
+        warn_of(f"{part.name}: its texture needs {need} pixels, and has {size[0]:,} x {size[1]:,} in the file")
     x, y = (k.ravel() for k in np.meshgrid(*(np.arange(n) for n in size)))
     rho = np.zeros((len(x), 3))
     # A pixel that holds many texels shows their mean: one random point in each of its cells, so that no period of the
@@ -73,22 +81,22 @@ def _bake(bsdf, back, low, high):
     return Texture(rho.reshape(size[1], size[0], 3), low, high)
 
 
-def _resolution(bsdf, span):
-    """Width and height in pixels, those of the largest bitmap in a BSDF, as often as it is repeated, where that is
-    possible; and is one point per pixel enough, which is then the middle of a texel, or is in one?"""
-    values = dict(mi.traverse(bsdf))
-    wanted = [
-        np.array(value.shape[1::-1]) * span * _repeats(values.get(name.removesuffix("data") + "to_uv"))
-        for name, value in values.items()
-        if name.endswith("data") and dr.is_tensor_v(value)
-    ]
-    most = np.max(wanted, axis=0) if wanted else np.array([np.inf, np.inf])
-    size = np.clip(np.ceil(np.where(np.isfinite(most), most, FEWEST)), FEWEST, MOST)
-    return tuple(int(n) for n in size), bool((most <= size).all())
-
-
-def _repeats(to_uv):
-    """How often a texture is repeated along both axes by a transform of its coordinates (float [2])."""
-    if to_uv is None:
-        return np.ones(2)
-    return np.abs(np.array(to_uv.matrix, dtype=np.float64)[:2, :2]).max(axis=0)
+def _density(thing):
+    """Pixels per unit of u and v that the textures in a BSDF need: the finest of all (float [2])."""
+    finest = np.zeros(2)
+    for part in children(thing):
+        if isinstance(part, mi.BSDF):
+            finest = np.maximum(finest, _density(part))
+            continue
+        values = dict(mi.traverse(part))
+        if "data" in values:
+            size = np.array(values["data"].shape[1::-1], dtype=np.float64)
+        elif part.class_name() == "Checkerboard":
+            size = np.full(2, 2.0 * CELL)  # two cells per unit
+        else:
+            continue
+        if "to_uv" in values:  # columns: where steps of u and v go in the texture
+            matrix = np.array(values["to_uv"].matrix, dtype=np.float64).reshape(3, 3, -1)[:2, :2, 0]
+            size = np.linalg.norm(matrix * size[:, None], axis=0)
+        finest = np.maximum(finest, size)
+    return finest

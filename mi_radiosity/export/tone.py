@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.errors import RadiosityError
+from ..core.numbers import real_number
 
 if TYPE_CHECKING:
     from .geometry import LitMesh
@@ -18,13 +19,11 @@ def checked(exposure: float | str, path: Path | None = None) -> float | str:
     """A number > 0, or "auto". Raises RadiosityError for anything else, and if the file at ``path`` holds light, which
     has no exposure."""
     value: float | str = "auto"
-    if exposure != "auto":
+    if not (isinstance(exposure, str) and exposure == "auto"):
         try:
-            value = float(exposure)
-        except ValueError:
-            value = 0.0
-        if not 0 < value < float("inf"):
-            raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}")
+            value = real_number("exposure", float(exposure) if isinstance(exposure, str) else exposure, 0)
+        except ValueError:  # RadiosityError is one of them
+            raise RadiosityError(f"the exposure must be 'auto' or a number greater than 0, not {exposure}") from None
     if value != 1 and path is not None and path.suffix.lower() in HOLD_LIGHT:
         raise RadiosityError(f"{path} holds light, which has no exposure: leave that out")
     return value

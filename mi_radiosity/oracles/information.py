@@ -1,6 +1,5 @@
 """Oracles from generalised mutual information (Havrda-Charvát-Tsallis), and their common kernel."""
 
-import math
 from dataclasses import dataclass, field
 
 import drjit as dr
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.errors import RadiosityError
 from ..core.llvm import require_variant
+from ..core.numbers import real_number
 from .base import KernelSamples, Oracle, Pair
 
 NEAR_ONE = 2.0**-5  # |u − 1| below which φ_α is summed as a series
@@ -58,7 +58,7 @@ def information_gap(F: KernelSamples | ArrayLike, alpha: float) -> "mi.Float64":
     Raises RadiosityError for α ≤ 0 and for NaN, infinite or negative samples in a [pairs, lines] array.
     Source: Rigau, Feixas, Sbert, "A generalised-mutual-information-based oracle for hierarchical radiosity".
     """
-    alpha = _checked(alpha)
+    alpha = real_number("alpha", alpha, 0)
     require_variant()
     samples = F if isinstance(F, KernelSamples) else _samples(F)
     if samples.pairs == 0:
@@ -80,16 +80,6 @@ def _samples(F):
     return KernelSamples(mi.Float64(array.ravel()), array.shape[1])
 
 
-def _checked(alpha):
-    try:
-        alpha = float(alpha)
-    except (TypeError, ValueError):
-        alpha = math.nan
-    if not (alpha > 0 and math.isfinite(alpha)):
-        raise RadiosityError("alpha must be a finite number greater than 0, such as 0.5")
-    return alpha
-
-
 @dataclass(frozen=True)
 class GMI(Oracle):
     """σ_ij = A_i A_j A_T^(α−2) δ_α/(1−α)  (eq. 14): the loss of generalised mutual information.
@@ -102,7 +92,7 @@ class GMI(Oracle):
     name = "gmi"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", _checked(self.alpha))
+        object.__setattr__(self, "alpha", real_number("alpha", self.alpha, 0))
 
     def sigma(self, samples: KernelSamples, pair: Pair) -> "mi.Float64":
         scale = dr.opaque(mi.Float64, pair.total_area ** (self.alpha - 2))

@@ -17,6 +17,7 @@ from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
 NESTING = {"TwoSidedBRDF", "BlendBSDF"}
+OVER_UV = ("BitmapTexture", "Checkerboard", "RawConstant")  # beginnings of the classes of textures over (u, v)
 CONSTANT = {"SRGBReflectanceSpectrum", "UniformSpectrum", "SRGBEmitterSpectrum", "D65Spectrum"}
 GLASS = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 FRAMES = {"NormalMap", "BumpMap"}
@@ -204,6 +205,26 @@ def is_textured(bsdf: "mi.BSDF") -> bool:
     return any(
         is_textured(part) if isinstance(part, mi.BSDF) else part.class_name() not in CONSTANT for part in children(bsdf)
     )
+
+
+def textures_of(bsdf: "mi.BSDF") -> list[str]:
+    """Classes of the textures that a BSDF and those in it are made of, without constant ones."""
+    found = []
+    for part in children(bsdf):
+        if isinstance(part, mi.BSDF):
+            found += textures_of(part)
+        elif part.class_name() not in CONSTANT:
+            found.append(part.class_name())
+    return found
+
+
+def varies_over_uv(bsdf: "mi.BSDF") -> bool:
+    """Does the reflectance of ``bsdf`` vary with texture coordinates, and with nothing else?
+
+    Colours of vertices and faces, and textures in space, vary with more than those.
+    """
+    names = textures_of(bsdf)
+    return bool(names) and all(name.startswith(OVER_UV) for name in names)
 
 
 def _inspect_shape(shape):

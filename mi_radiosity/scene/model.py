@@ -35,6 +35,11 @@ class Model:
 
     def __init__(self, scene: "mi.Scene", sides: np.ndarray | None = None, lit: bool = True) -> None:
         require_variant()
+        if not isinstance(scene, mi.Scene):
+            raise RadiosityError(
+                f"the scene must be a mi.Scene of the variant {mi.variant()}, such as mi.load_file(...) returns, "
+                f"not {type(scene).__name__}"
+            )
         require_supported(scene)
         self.scene, self.state = scene, State(scene)
         self.faces = Faces(scene)

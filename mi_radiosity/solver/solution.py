@@ -18,6 +18,7 @@ from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
+from ..core.numbers import real_number, whole_number
 from ..mesh import Elements, Exposure
 from ..mesh.crown import Crown
 from ..mesh.elements import mean_exitance
@@ -104,8 +105,7 @@ class Solution:
         if points is None:
             return self.direct + self.indirect
         where, towards = _checked_points(points, normals)
-        if samples < 1:
-            raise RadiosityError(f"{samples} samples measure nothing: ask for 1 or more")
+        samples, seed = whole_number("samples", samples), whole_number("seed", seed, None)
         report = partial(progress, "gather")
         found = probe(self.gatherer, self.model, where, towards, samples, seed, lambda done: report(done, len(where)))
         if self.caustic is not None and len(where):
@@ -204,20 +204,23 @@ class Solution:
         denoise: bool = False,
         seconds: float | None = None,
         show: "Callable[[Callable[[], mi.TensorXf], int], None] | None" = None,
+        hide_emitters: bool | None = None,
     ) -> "mi.TensorXf":
         """Picture from a sensor (mi.Sensor or its number); nothing is solved again.
 
         shading: ``gather`` and ``direct`` gather light at every pixel, ``gouraud`` and ``flat`` show what was solved.
         denoise: remove the noise of the samples, four per pixel at least and most where they are needed, by Open Image
-        Denoise (extra ``denoise``); the picture has 3 channels.
+        Denoise (extra ``denoise``).
         seconds: take as many samples as fit, instead of ``spp``; show(image, samples) is told after
         every pass, image() being the picture then.
+        hide_emitters: are emitters and the sky invisible to the camera? By default what the scene's own integrator
+        says. The picture has the channels of the sensor's film.
         Raises RadiosityError if the scene has been edited since it was solved.
         """
-        if seconds is not None and not 0 < seconds < float("inf"):
-            raise RadiosityError(f"seconds must be a number greater than 0, not {seconds}")
+        spp, seed = whole_number("spp", spp), whole_number("seed", seed, None)
+        seconds = None if seconds is None else real_number("seconds", seconds, 0)
         integrator = mi.load_dict({"type": "radiosity"})
-        integrator.show(self, shading)
+        integrator.show(self, shading, hide_emitters)
         return integrator.picture(self.model.scene, sensor, seed, spp, denoise, seconds, show)
 
     def relight(self, scales: Scales) -> "Solution":

@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.errors import RadiosityError, interruptible
+from ..core.numbers import real_number, whole_number
 from ..core.points import Stream, stream_seed
 from ..mesh import Clusters, Exposure, Pairs, Tree, cluster_labels, crossed_leaves
 from ..oracles import GMI, Oracle
@@ -55,11 +56,18 @@ def solve(
     (stage, done, total), stage being "refine" or "distribute" (total is None where it is not known).
 
     Returns a Solution; ``stats["warnings"]`` says if the rays are too few for the elements, and if the mesh has another
-    number of elements than was asked for. The solution of a scene that no light reaches is black. Raises RadiosityError
-    for options and scenes that cannot be used.
+    number of elements than was asked for. The solution of a scene that no light reaches is black. Numbers may be
+    Python's or NumPy's; 1e6 is a whole number, 1.5 and True are none. Raises RadiosityError for options and scenes that
+    cannot be used.
     """
     oracle, transport = oracle or GMI(0.5), transport or Gathering()
-    _check(oracle, elements, epsilon, rays, lines, seconds)
+    _check(oracle, transport, pilot, elements, epsilon)
+    elements, rays = (
+        None if n is None else whole_number(name, n) for name, n in (("elements", elements), ("rays", rays))
+    )
+    epsilon = None if epsilon is None else real_number("epsilon", epsilon, 0)
+    seconds = None if seconds is None else real_number("seconds", seconds, 0)
+    lines, seed = whole_number("lines", lines), whole_number("seed", seed, None)
     report, clock = progress or (lambda stage, done, total: None), _Clock()
 
     model = scene if isinstance(scene, Model) else Model(scene)
@@ -70,7 +78,7 @@ def solve(
     wanted, shared = plan(model, elements, epsilon)
 
     tree = Tree(model.patches, model.materials, model.lights, _clusters(model, shared))
-    pairs = Pairs(tree, model.rays, oracle, int(lines), seed)
+    pairs = Pairs(tree, model.rays, oracle, lines, seed)
     refinement = Refinement(
         model,
         tree,
@@ -89,7 +97,7 @@ def solve(
     count = tree.leaf_count
     clock.lap("refine")
 
-    rays = int(rays or default_rays(model, count))
+    rays = rays or default_rays(model, count)
     if seconds is not None and not fixed:  # now that it is known what refinement took
         rays = affordable(rays, count, seconds, clock.total(), pace.ray)
 
@@ -149,20 +157,17 @@ def _clusters(model, shared):
     return cluster_labels(model.faces, model.patches, crossed, top_of(shared))
 
 
-def _check(oracle, elements, epsilon, rays, lines, seconds):
-    """Refuse options that make no sense."""
+def _check(oracle, transport, pilot, elements, epsilon):
+    """Refuse options of the wrong kind, and options that exclude each other."""
     if not isinstance(oracle, Oracle):
         raise RadiosityError(
             f"the oracle must be an instance of mi_radiosity.Oracle, such as GMI(alpha=0.5), not {oracle!r}"
         )
     if elements is not None and epsilon is not None:
         raise RadiosityError("give either elements or epsilon, not both")
-    for name, value in (("elements", elements), ("rays", rays), ("lines", lines)):
-        if value is not None and (value != int(value) or value <= 0):
-            raise RadiosityError(f"{name} must be a whole number greater than 0, not {value}")
-    for name, value in (("epsilon", epsilon), ("seconds", seconds)):
-        if value is not None and not 0 < value < float("inf"):
-            raise RadiosityError(f"{name} must be a number greater than 0, not {value}")
+    for name, value in (("transport", transport), ("pilot", pilot)):
+        if not callable(value):
+            raise RadiosityError(f"{name} must be a mi_radiosity.Transport, such as Gathering(), not {value!r}")
 
 
 def _shortfall(asked, epsilon, count, why):

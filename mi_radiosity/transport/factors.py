@@ -11,6 +11,7 @@ import numpy as np
 from ..core.balance import balance, like
 from ..core.errors import RadiosityError, interruptible
 from ..core.extras import optional
+from ..core.numbers import whole_number
 from ..mesh import Elements, Tree
 from ..scene import Model
 from .contour import exchange_area
@@ -19,7 +20,10 @@ from .sample_lines import LINES, visible_sums
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
 FEW = 8  # rays that connect two cells from which sample lines are worth their cost
-RAMP = 16, 64  # expected rays between two cells: below the first, rays alone decide; from the second, sample lines alone
+RAMP = (
+    16,
+    64,
+)  # expected rays between two cells: below the first, rays alone decide; from the second, sample lines alone
 UNSEEN = 2  # rays or sample lines that every error allows for beyond the observed ones (Agresti and Coull)
 
 
@@ -102,11 +106,8 @@ def view_factors(
     the kernel. Raises RadiosityError for options and scenes that cannot be used.
     """
     start = time.perf_counter()
-    rays = RAYS.get(level, 1) if rays is None else rays
-    if rays != int(rays) or rays <= 0:
-        raise RadiosityError(f"rays must be a whole number greater than 0, not {rays}")
-    if not np.isfinite(up).all() or not np.any(up):
-        raise RadiosityError(f"up must be a direction, not {up}")
+    rays = RAYS.get(level, 1) if rays is None else whole_number("rays", rays)
+    seed, up = whole_number("seed", seed, None), _direction(up)
     report = progress or (lambda stage, done, total: None)
     model = scene if isinstance(scene, Model) else Model(scene, lit=False)
     if level == "leaf" and elements is None:
@@ -114,9 +115,20 @@ def view_factors(
     facets = Facets(
         model, Tree(model.patches, model.materials, model.lights).freeze() if elements is None else elements, level
     )
-    counts = count_rays(facets, int(rays), seed, up, lambda done, total: report("trace", done, total))
+    counts = count_rays(facets, rays, seed, up, lambda done, total: report("trace", done, total))
     flow = _Exchange(facets, counts, seed, lambda done, total: report("connect", done, total))
     return _closed(facets, counts, flow, start)
+
+
+def _direction(up):
+    """Three finite numbers, not all 0, as Python floats."""
+    try:
+        axis = np.asarray(up, dtype=np.float64)
+    except (TypeError, ValueError):
+        axis = np.zeros(0)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+        raise RadiosityError(f"up must be a direction, not {up}: give three numbers, such as (0, 0, 1)")
+    return tuple(axis.tolist())
 
 
 class _Exchange:
