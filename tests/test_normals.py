@@ -123,8 +123,8 @@ def test_instances_textures_and_attributes_are_kept():
     """The repaired mesh has the colours of the mesh, where an instance places it as well."""
     colors = np.array([[0.2, 0.4, 0.6], [0.8, 0.4, 0.6], [0.8, 0.1, 0.6], [0.2, 0.4, 0.1]])
     by_vertex = {"type": "mesh_attribute", "name": "vertex_color"}
-    pixels = mi.TensorXf(np.array([[[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]], dtype=np.float32))
-    by_texture = {"type": "bitmap", "raw": True, "data": pixels}
+    pixels = mi.Bitmap(np.array([[[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]], dtype=np.float32))
+    by_texture = {"type": "bitmap", "raw": True, "bitmap": pixels}
     uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
     for reflectance, more in ((by_vertex, {"vertex_color": colors}), (by_texture, {"uv": uv})):
         found = []
