@@ -28,7 +28,8 @@ class Trail:
 
     ``patch`` is NONE for rays that escape (not ``valid``) or end without a diffuse lobe. ``traced`` says that rays met
     a surface with other lobes than a diffuse one. ``weight``: what is left of a ray at its end; where that surface has
-    other lobes, too, times the weight of the diffuse lobe that was drawn over its mean ρ, so that the mean is right.
+    other lobes, too, times the weight of the diffuse lobe that was drawn, whether it reflects or transmits, over the
+    mean ρ + τ of the side that the ray hits, so that the mean is right.
     ``taken``: power that the lobes on the way kept, less what they sent on from surfaces that count all of
     theirs as received; per power of the ray. ``glow``: E of the surfaces on the way that have other lobes, the one at
     the end included (it is ``coated``), and of lamps that lines from rough lobes have found, times the weight there,

@@ -90,7 +90,7 @@ class Lobes:
             parts = gloss.shares(bsdf, si, alive)
             value = gloss.weigh(bsdf, si, sample, value, parts)
         value = dr.select(alive & dr.isfinite(value), value, 0)
-        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse)
         coated = alive & drawn & on_patch & (dr.max(value) > 0)
         on = alive & ~coated
         rough = on & (parts[0] > 0) & ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta | mi.BSDFFlags.Null)
@@ -99,8 +99,9 @@ class Lobes:
         glow = before * dr.gather(mi.Color3f, rays.patches.emission, trail.patch, shines) * trail.share
         if highlights is not None:
             glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, alive & (parts[0] > 0))
-        rho = dr.gather(mi.Color3f, rays.patches.reflectance, trail.patch, coated)
-        factor = dr.select(coated, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
+        # Light that a side reflects or transmits diffusely counts as received by that side, which sends it on.
+        albedo = dr.gather(mi.Color3f, rays.patches.albedo, trail.patch, coated)
+        factor = dr.select(coated, dr.select(albedo > 0, value / albedo, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that meets them as received, the others nothing.
         taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
 
