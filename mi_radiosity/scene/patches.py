@@ -81,7 +81,8 @@ class Patches:
             return None
         row = np.full(2 * (int(self.sides.max()) // 2) + 2, -1)
         row[self.sides] = np.arange(self.count)
-        other, transmits = row[self.sides ^ 1], np.array(self.transmittance).reshape(3, -1).any(axis=0)
+        other, tau = row[self.sides ^ 1], np.array(self.transmittance).reshape(3, -1)
+        transmits = tau.max(axis=0) > 0
         there = (other >= 0) & (transmits | transmits[other])
         return np.where(there, other, NONE) if there.any() else None
 

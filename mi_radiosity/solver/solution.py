@@ -177,9 +177,10 @@ class Solution:
     @cached_property
     def gatherer(self) -> Gatherer:
         """What gathers irradiance at any places, by this solution's radiosity."""
-        light, looks = self.irradiance(), self.sharp is not None
+        light = self.direct + self.indirect
         # Gather rays look for sharp light where they end, but only for the part that is reflected there.
-        reflected = self.scattering.of_elements(light - self.sharp if looks else light, light)
+        reflected = self.scattering.of_elements(light if self.sharp is None else light - self.sharp, light)
+        looks = self.sharp is not None
         return Gatherer(self.model, self.elements, self.exposure, self.landings, reflected, looks, self.sharp)
 
     def leaves(self) -> Leaves:
