@@ -89,7 +89,7 @@ class Lobes:
         if rays.glossy:
             parts = gloss.shares(bsdf, si, alive)
             value = gloss.weigh(bsdf, si, sample, value, parts)
-        value = dr.select(alive & dr.isfinite(value), value, 0)
+        value = dr.select(alive & is_sound(si, sample, value), value, 0)
         drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse)
         coated = alive & drawn & on_patch & (dr.max(value) > 0)
         on = alive & ~coated
@@ -130,6 +130,16 @@ class Lobes:
             rough=dr.select(trail.bounced, trail.rough, rough),
         )
         return goes_on & hit.traced, met, ray, depth, chance.random, trail
+
+
+def is_sound(si: "mi.SurfaceInteraction3f", sample: "mi.BSDFSample3f", value: "mi.Color3f") -> "dr.ArrayBase":
+    """Are samples of BSDFs finite and of a possible direction (Bool, or one per channel [n])?
+
+    A BlendBSDF that draws a one-sided `diffuse` from behind gives a direction on the front side the weight of its other
+    BSDF, which may transmit. The density of that direction does not include the draw, so the sample is void.
+    """
+    reflects = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+    return dr.isfinite(value) & ~(reflects & (sample.wo.z * si.wi.z < 0))
 
 
 @contextmanager
