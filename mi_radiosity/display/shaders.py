@@ -59,8 +59,21 @@ class Shader:
         raise NotImplementedError(f"{type(self).__name__} must define irradiance(look)")
 
     def radiance(self, look: Look) -> "mi.Color3f":
-        """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays])."""
-        return (look.emission + look.reflectance * self.irradiance(look)) * dr.inv_pi
+        """L = (E + ρ H) / π, W/(m² sr) (Color3f [rays]); τ H of the other side is added where a face transmits."""
+        leaving = look.emission + look.reflectance * self.irradiance(look)
+        if (behind := self._behind(look)) is not None:
+            leaving += dr.select(behind.lit, behind.reflectance * self.irradiance(behind), 0)
+        return leaving * dr.inv_pi
+
+    def _behind(self, look):
+        """The other side of the faces that rays meet, with τ in place of ρ (Look); None if no face transmits."""
+        behind = self.solution.model.patches.behind(dr.select(look.lit, look.hit.patch, 0), look.lit)
+        if behind is None:
+            return None
+        twin, tau, there = behind
+        hit = replace(look.hit, patch=twin)
+        leaf = self.solution.elements.leaf_at(twin, hit.u, hit.v, there)
+        return replace(look, hit=hit, leaf=leaf, emission=mi.Color3f(0), reflectance=tau, lit=there)
 
     @cached_property
     def paths(self) -> Paths:

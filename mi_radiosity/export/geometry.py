@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass, fields
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import owned
+from ..core.arrays import NONE, owned
+from ..mesh.exposure import TUCK
 from ..mesh.subdivision import NODES
 from ..scene import Model
 from ..scene.materials import is_diffuse, is_textured, varies_over_uv
@@ -13,7 +15,7 @@ from ..scene.tessellate import Part
 from ..solver import Solution
 from ..solver.field import Field
 from .cutting import cut, sides_of
-from .walls import beside_walls
+from .walls import beside_walls, patch_coordinates
 
 APART = 0.02  # how far, relatively, a value beside a wall may be from that of its vertex and still be welded to it
 
@@ -42,6 +44,9 @@ class LitMesh:
     back: np.ndarray  # [triangles] bool: the back of the shape
     above: np.ndarray  # [triangles] how many lit sides lie in the same plane below it
     lamps: np.ndarray  # [vertices, lamps, 2, 3] direct and indirect by lamp, if asked for; else there are 0 lamps
+    # [vertices, 1 + lamps, 2, 3] τ H of the other side of faces that transmit, W/m²: from all emitters, then by lamp;
+    # direct and indirect
+    through: np.ndarray
 
     @property
     def irradiance(self) -> np.ndarray:
@@ -50,8 +55,8 @@ class LitMesh:
 
     @property
     def radiosity(self) -> np.ndarray:
-        """B = E + ρ H, W/m² [vertices, 3]."""
-        return self.emission + self.reflectance * self.irradiance
+        """B = E + ρ H, W/m² [vertices, 3]; where faces transmit, τ H of the other side is added."""
+        return self.emission + self.reflectance * self.irradiance + self.through[:, 0].sum(axis=1)
 
     @property
     def size(self) -> float:
@@ -98,6 +103,7 @@ def lit_mesh(solution: Solution, by_lamp: bool = False) -> LitMesh:
         np.zeros(n, dtype=bool),
         np.zeros(n, dtype=np.int64),
         np.zeros((3 * n, *mesh.lamps.shape[1:])),
+        np.zeros((3 * n, *mesh.through.shape[1:])),
     )
     return LitMesh(*(np.concatenate([getattr(m, field.name) for m in (mesh, more)]) for field in fields(LitMesh)))
 
@@ -113,8 +119,8 @@ def dark_faces(model: Model) -> np.ndarray:
     known[np.array(model.patches.face)] = True
     if model.rays.overlaps:
         known[model.rays.overlaps.under // 2] = True
-    shapes = [part.shape for part in faces.parts]
-    clear = [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes]
+    through = int(mi.BSDFFlags.Transmission) & ~int(mi.BSDFFlags.DiffuseTransmission)
+    clear = [bool(int(part.shape.bsdf().flags()) & through) for part in faces.parts]
     return np.flatnonzero(~known & ~faces.degenerate & ~np.array(clear)[faces.shape])
 
 
@@ -130,9 +136,7 @@ def _lit(solution, by_lamp):
     pieces, of = cut(corner[leaves].astype(np.int64), sides_of(vertices, elements))
     table = np.hstack([_points(model, elements, corner, vertices.count), *(_known(f, corner[leaves]) for f in layers)])
     table, pieces, of, values, beside = beside_walls(solution, layers, table, pieces, of)
-    values = values.reshape(*pieces.shape, -1, 2, 3)  # for all lamps and for each: in all, direct
-    values[..., 1, :] = np.minimum(values[..., 1, :], values[..., 0, :])
-    values = values.reshape(*pieces.shape, -1)
+    values = _with_direct_below(values, pieces.shape).reshape(*pieces.shape, -1)
     mean = values.mean(axis=(0, 1)) + 1e-30
 
     patch = np.array(elements.patch)[leaves[of]]
@@ -166,8 +170,41 @@ def _lit(solution, by_lamp):
         shape=shape,
         back=back,
         above=sides_below(model, face, back),
-        lamps=np.stack([values[:, 1:, 1], values[:, 1:, 0] - values[:, 1:, 1]], axis=2),
+        lamps=_direct_and_indirect(values[:, 1:]),
+        through=_through(solution, layers, patch, table[pieces, :3], number, len(first)),
     )
+
+
+def _with_direct_below(values, shape):
+    """Light of all emitters and of each, in all and direct, which is no more [*shape, lights, 2, 3]."""
+    values = values.reshape(*shape, -1, 2, 3)
+    values[..., 1, :] = np.minimum(values[..., 1, :], values[..., 0, :])
+    return values
+
+
+def _direct_and_indirect(values):
+    """Direct and indirect light from light in all and direct [vertices, lights, 2, 3]."""
+    return np.stack([values[:, :, 1], values[:, :, 0] - values[:, :, 1]], axis=2)
+
+
+def _through(solution, fields, patch, points, number, count):
+    """τ H of the other side at vertices, direct and indirect [count, lights, 2, 3]: means over the corners of pieces
+    of patches, ``points`` [pieces, 3, 3], whose vertices are ``number`` [pieces, 3]."""
+    patches, lights = solution.model.patches, len(fields) // 2
+    found = np.zeros((count, 3 * len(fields)))
+    if patches.twin is None:
+        return found.reshape(count, lights, 2, 3)
+    chosen = np.flatnonzero(patches.twin[patch] != NONE)
+    inside = (1 - TUCK) * points[chosen] + TUCK * points[chosen].mean(axis=1, keepdims=True)
+    here = owned(mi.UInt32, np.repeat(patch[chosen], 3))
+    u, v = patch_coordinates(patches, here, inside.reshape(-1, 3) - solution.model.faces.centre)
+    twin, tau, there = patches.behind(here)
+    leaf = solution.elements.leaf_at(twin, u, v, there)
+    light = np.concatenate([np.array(tau * dr.select(there, field.at(leaf, u, v, there), 0)) for field in fields]).T
+    for at, column in zip(found.T, light.T):
+        at += np.bincount(number[chosen].ravel(), column, count)
+    found /= np.maximum(np.bincount(number[chosen].ravel(), minlength=count), 1)[:, None]
+    return _direct_and_indirect(_with_direct_below(found, (count,)))
 
 
 def sides_below(model: Model, face: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -184,9 +221,10 @@ def sides_below(model: Model, face: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 def _points(model, elements, corner, count):
     """Where vertices are [count, 3], in float64: as the first element has them."""
-    patch, faces = np.array(elements.patch), model.faces
+    chosen, faces = corner[:, 0] != NONE, model.faces  # clusters have no corners
+    corner, patch = corner[chosen], np.array(elements.patch)[chosen]
     face = np.array(model.patches.face)[patch]
-    u0, v0, scale = (np.array(x, dtype=np.float64)[:, None] for x in (elements.u0, elements.v0, elements.scale))
+    u0, v0, scale = (np.array(x, dtype=np.float64)[chosen, None] for x in (elements.u0, elements.v0, elements.scale))
     points = np.empty((count, 3))
     for k, (a, b) in enumerate(NODES[:3]):
         at = faces.corners[face, 0] + (u0 + scale * a) * faces.e1[face] + (v0 + scale * b) * faces.e2[face]

@@ -4,8 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import owned
 from ..core.errors import RadiosityError
 from ..core.extras import optional
 from ..core.numbers import whole_number
@@ -27,6 +30,8 @@ class Lightmap:
     """Irradiance over an atlas; the first row of the pictures is at the top, as in glTF.
 
     irradiance: H, W/m² [size, size, 3]. radiosity: B = E + ρ H, W/m² [size, size, 3]. reflectance: ρ [size, size, 3].
+    through: τ H of the other side of faces that transmit diffusely, part of B, W/m² [size, size, 3]. albedo: ρ + τ
+    [size, size, 3].
     open: texels that light was gathered for [size, size]; the others are filled from their neighbours, or black.
     area: what of the surface is open in each texel, m² [size, size]. error: standard error of H [size, size, 3].
     """
@@ -39,10 +44,23 @@ class Lightmap:
     area: np.ndarray
     error: np.ndarray
     rays: int
+    through: np.ndarray
+    albedo: np.ndarray
 
     @property
     def radiosity(self) -> np.ndarray:
-        return self.emission + self.reflectance * self.irradiance
+        return self.emission + self.scattered
+
+    @property
+    def scattered(self) -> np.ndarray:
+        """Radiosity without emission, ρ H + τ H of the other side, W/m² [size, size, 3]."""
+        return self.reflectance * self.irradiance + self.through
+
+    @property
+    def effective(self) -> np.ndarray:
+        """What times ρ + τ is `scattered`: H itself where faces do not transmit, W/m² [size, size, 3]."""
+        transmits = self.albedo > self.reflectance
+        return np.where(transmits, self.scattered / np.where(transmits, self.albedo, 1), self.irradiance)
 
     def mean(self) -> np.ndarray:
         """Mean irradiance of the open area, W/m² [3]."""
@@ -76,8 +94,10 @@ def lightmap(
         where = spots(atlas)
     progress("unwrap", 1, 1)
     texels = _gather(solution, atlas, where, -(-samples // len(SPOTS)), seed, progress)
-    light = _denoised(texels.irradiance) if denoise else texels.irradiance
-    return replace(texels, irradiance=level_seams(solution.model, atlas, light, texels.open))
+    light, through = texels.irradiance, texels.through
+    if denoise:
+        light, through = _denoised(light), _denoised(through) if through.any() else through
+    return replace(texels, irradiance=level_seams(solution.model, atlas, light, texels.open), through=through)
 
 
 def check_budget(size: int, samples: int, denoise: bool = False) -> int:
@@ -110,7 +130,11 @@ def _gather(solution, atlas, where, samples, seed, progress):
     count = valid.reshape(n, k).sum(axis=1)[:, None]
     mean = H.reshape(n, k, 3).sum(axis=1) / np.maximum(count, 1)
     deviation = np.sqrt((error**2).reshape(n, k, 3).sum(axis=1)) / np.maximum(count, 1)
-    rho = reflectance(model, patch, uv).reshape(n, k, 3).mean(axis=1)
+    rho, albedo, through, more = _other_side(
+        solution, points, normals, patch, uv, valid.ravel(), samples, seed, progress
+    )
+    rho, albedo = (x.reshape(n, k, 3).mean(axis=1) for x in (rho, albedo))
+    through = through.reshape(n, k, 3).sum(axis=1) / np.maximum(count, 1)
     area = (atlas.texel_area(model)[where.piece] * (valid.reshape(n, k) & where.inside)).mean(axis=1)
     E = emission(model, patch, uv).reshape(n, k, 3).mean(axis=1)
 
@@ -122,11 +146,27 @@ def _gather(solution, atlas, where, samples, seed, progress):
     chart = np.full(atlas.size**2, -1)
     chart[where.texel] = where.chart
     known = image(count[:, 0] > 0, bool)
-    fields = np.concatenate([image(mean), image(rho), image(E)], axis=2)
+    fields = np.concatenate([image(x) for x in (mean, rho, E, through, albedo)], axis=2)
     fields = fill(fields, known, chart.reshape(known.shape))
-    H, rho, E = np.split(fields, 3, axis=2)
-    rays = 2 * len(chosen) * -(-samples // 16) * 16
-    return Lightmap(atlas, H, rho, E, known, image(area), image(deviation), rays)
+    H, rho, E, through, albedo = np.split(fields, 5, axis=2)
+    rays = 2 * (len(chosen) + more) * -(-samples // 16) * 16
+    return Lightmap(atlas, H, rho, E, known, image(area), image(deviation), rays, through, albedo)
+
+
+def _other_side(solution, points, normals, patch, uv, valid, samples, seed, progress):
+    """ρ, ρ + τ, and τ H of the other side at points of patches (three [n, 3]), and how many points gathered that H."""
+    patches, rho = solution.model.patches, reflectance(solution.model, patch, uv)
+    through, here = np.zeros_like(rho), owned(mi.UInt32, patch)
+    behind = patches.behind(here)
+    if behind is None:
+        return rho, rho, through, 0
+    tau, there = np.array(behind[1]).T, np.array(behind[2]).astype(bool)
+    own, albedo = (np.array(dr.gather(mi.Color3f, x, here)).T for x in (patches.reflectance, patches.albedo))
+    rho = np.where(there[:, None], own, rho)
+    chosen = np.flatnonzero(valid & there)
+    H = solution.irradiance(points[chosen], -normals[chosen], samples=samples, seed=seed, progress=progress)
+    through[chosen] = tau[chosen] * H
+    return rho, np.where(there[:, None], albedo, rho), through, len(chosen)
 
 
 def _in_one_place(model, points, normals, valid):

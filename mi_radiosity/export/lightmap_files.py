@@ -120,10 +120,10 @@ def _picture(found, unlit, exposure):
     """The light as a PNG file, and what its white stands for."""
     if unlit:
         return png(found.radiosity / np.pi * exposure), 1.0
-    white = max(_brightest(found, found.irradiance, 1 - CLIPPED), 1e-30)
+    white = max(_brightest(found, found.effective, 1 - CLIPPED), 1e-30)
     # Linear light in 8 bits shows bands, unless it is dithered; black stays black.
-    dither = np.random.default_rng(0).uniform(-0.5, 0.5, found.irradiance.shape)
-    values = np.clip(found.irradiance / white, 0, 1) * 255
+    dither = np.random.default_rng(0).uniform(-0.5, 0.5, found.effective.shape)
+    values = np.clip(found.effective / white, 0, 1) * 255
     return png8(np.round(values + np.where(values > 0, dither, 0)).clip(0, 255).astype(np.uint8)), white
 
 
@@ -139,8 +139,7 @@ def _lit_materials(file, texture, model, found, intensity, exposure):
     materials(shape, name, patches) gives (mask, number) pairs.
     """
     rho, emission = (
-        np.array(x, dtype=np.float64).reshape(3, -1).T.round(4)
-        for x in (model.patches.reflectance, model.patches.emission)
+        np.array(x, dtype=np.float64).reshape(3, -1).T.round(4) for x in (model.patches.albedo, model.patches.emission)
     )
     colors: list[int] = []
 
@@ -148,7 +147,7 @@ def _lit_materials(file, texture, model, found, intensity, exposure):
         if not textured:
             return {"baseColorFactor": [*color.tolist(), 1.0]}
         if not colors:
-            colors.append(file.add_texture(png(found.reflectance), mipmaps=False))
+            colors.append(file.add_texture(png(found.albedo), mipmaps=False))
         return {"baseColorTexture": file.lib.TextureInfo(index=colors[0])}
 
     def materials(shape, name, patch):

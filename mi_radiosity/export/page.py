@@ -11,8 +11,10 @@ from importlib import resources
 from string import Template
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import owned_vectors
 from ..core.color import LUMENS_PER_WATT, LUMINANCE
 from ..core.files import check_writable, writing
 from ..core.numbers import whole_number
@@ -104,7 +106,8 @@ def _dimmed(mesh: LitMesh, layers: Layers) -> LitMesh:
     lamp = np.full(len(mesh.vertices), -1)
     lamp[mesh.triangles] = layers.lamps.of_parts[mesh.shape][:, None]
     emission = mesh.emission * np.vstack([layers.scales, np.ones(3)])[lamp]
-    return replace(mesh, direct=direct, indirect=indirect, emission=emission)
+    through = np.einsum("lc,vlkc->vkc", layers.scales, mesh.through[:, 1:])[:, None]
+    return replace(mesh, direct=direct, indirect=indirect, emission=emission, through=through)
 
 
 def _data(solution: Solution, mesh: LitMesh) -> dict[str, Any]:
@@ -115,7 +118,8 @@ def _data(solution: Solution, mesh: LitMesh) -> dict[str, Any]:
     pictures = textures(mesh, parts)
     order, runs = _runs(mesh, solution, list(pictures))
     layers, light, leaf_light = _layers(solution, mesh)
-    unit = max(float(max(x.max() for x in (*light, mesh.emission))), 1e-30) / 2**15  # so that halves suffice
+    through, leaf_through = _through(solution, mesh)
+    unit = max(float(max(x.max() for x in (*light, *through, mesh.emission))), 1e-30) / 2**15  # so that halves suffice
     arrays = {
         "places": _packed(np.round((mesh.raised(RAISE * size) - low) / (size / GRID)).clip(0).astype(np.uint32)),
         "triangles": _packed(mesh.triangles[order].astype(np.uint32)),
@@ -124,9 +128,10 @@ def _data(solution: Solution, mesh: LitMesh) -> dict[str, Any]:
         "reflectance": _packed(np.round(mesh.reflectance * 65535).astype(np.uint16)),
         "emission": _packed(_halves(mesh.emission / unit)),
     }
-    for k, (of_vertices, of_leaves) in enumerate(zip(light, leaf_light)):
-        arrays[f"layer{k}"] = _packed(_halves(of_vertices / unit))
-        arrays[f"leaf_layer{k}"] = _packed(_halves(np.vstack([of_leaves, np.zeros(3)]) / unit))
+    for name, smooth, flat in (("layer", light, leaf_light), ("through", through, leaf_through)):
+        for k, (of_vertices, of_leaves) in enumerate(zip(smooth, flat)):
+            arrays[f"{name}{k}"] = _packed(_halves(of_vertices / unit))
+            arrays[f"leaf_{name}{k}"] = _packed(_halves(np.vstack([of_leaves, np.zeros(3)]) / unit))
     if pictures:
         arrays["uv"] = _packed(np.round(_placed(mesh, pictures) * 65535).astype(np.uint16))
     return {
@@ -162,6 +167,27 @@ def _layers(solution, mesh):
         [{"name": f"{name}, {KINDS[k]}", "kind": KINDS[k], "lamp": lamp} for lamp, name, k in every],
         [mesh.lamps[:, lamp, k] for lamp, _, k in every],
         [getattr(solution.layers, KINDS[k])[lamp].T[leaves] for lamp, _, k in every],
+    )
+
+
+def _through(solution, mesh):
+    """τ H of the other side, of every layer: of vertices [vertices, 3] and leaves [leaves, 3]; none if no face
+    transmits."""
+    if not solution.scattering.transmits:
+        return [], []
+    leaves = np.array(solution.elements.leaves)
+
+    def of_leaves(irradiance):
+        light = solution.scattering.transmitted(irradiance)
+        return np.array(light, dtype=np.float64).reshape(3, -1).T[leaves]
+
+    kinds, layers = range(len(KINDS)), solution.layers
+    if layers is None:
+        return [mesh.through[:, 0, k] for k in kinds], [of_leaves(getattr(solution, kind)) for kind in KINDS]
+    every = [(lamp, k) for lamp in range(len(layers.names)) for k in kinds]
+    return (
+        [mesh.through[:, 1 + lamp, k] for lamp, k in every],
+        [of_leaves(owned_vectors(mi.Color3f, getattr(layers, KINDS[k])[lamp].T)) for lamp, k in every],
     )
 
 

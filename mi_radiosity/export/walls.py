@@ -7,6 +7,7 @@ import numpy as np
 from ..core.arrays import owned, owned_vectors
 from ..core.points import coordinates
 from ..mesh.exposure import is_covered
+from ..scene.patches import Patches
 from ..solver import Solution
 from ..solver.field import Field
 from .cutting import Sides, cut, keys
@@ -57,7 +58,7 @@ def _fit(solution, fields, table, pieces, leaf, values):
     weight = np.column_stack([1 - a - b, a, b])  # [samples, 3]
     of = owned(mi.UInt32, np.repeat(leaf, len(a)))
     points = (weight @ table[pieces, :3]).reshape(-1, 3) - model.faces.centre
-    u, v = _patch_coordinates(model.patches, dr.gather(mi.UInt32, elements.patch, of), points)
+    u, v = patch_coordinates(model.patches, dr.gather(mi.UInt32, elements.patch, of), points)
     light = np.concatenate([np.array(f.at(of, u, v)) for f in fields]).T.reshape(len(pieces), len(a), -1)
     shown = ~np.array(is_covered(elements, model.rays, of, u, v)).astype(bool).reshape(len(pieces), -1)
     shown &= np.isfinite(light).all(axis=2)
@@ -72,7 +73,7 @@ def _fit(solution, fields, table, pieces, leaf, values):
     return fitted, (np.sqrt(error) > BREAK * (mean + 0.1 * values.mean(axis=(0, 1)))).any(axis=1)
 
 
-def _patch_coordinates(patches, patch, points):
-    """(u, v) on patches of points relative to their origin (two Float [n])."""
+def patch_coordinates(patches: Patches, patch: "mi.UInt32", points: np.ndarray) -> "tuple[mi.Float, mi.Float]":
+    """(u, v) on patches of points [n, 3] relative to their origin (two Float [n])."""
     p0, e1, e2 = (dr.gather(type(x), x, patch) for x in (patches.p0, patches.e1, patches.e2))
     return coordinates(owned_vectors(mi.Vector3f, points) - p0, e1, e2)

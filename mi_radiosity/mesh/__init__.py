@@ -4,5 +4,16 @@ from .clusters import Clusters, cluster_labels
 from .elements import MAX_LEVEL, Elements, Tree
 from .exposure import Exposure, crossed_leaves
 from .pairs import Pairs
+from .scattering import Scattering
 
-__all__ = ["MAX_LEVEL", "Clusters", "Elements", "Exposure", "Pairs", "Tree", "cluster_labels", "crossed_leaves"]
+__all__ = [
+    "MAX_LEVEL",
+    "Clusters",
+    "Elements",
+    "Exposure",
+    "Pairs",
+    "Scattering",
+    "Tree",
+    "cluster_labels",
+    "crossed_leaves",
+]

@@ -90,6 +90,23 @@ class Elements:
             return dr.gather(mi.Color3f, self.exitance, element)
         return dr.gather(mi.Color3f, self.patches.emission, dr.gather(mi.UInt32, self.patch, element))
 
+    def albedo(self, element: "mi.UInt32") -> "mi.Color3f":
+        """ρ + τ, the share of the irradiance of elements that leaves diffusely on either side (Color3f [n])."""
+        rho = dr.gather(mi.Color3f, self.reflectance, element)
+        if self.patches.twin is None:
+            return rho
+        patch = dr.gather(mi.UInt32, self.patch, element)
+        return rho + dr.gather(mi.Color3f, self.patches.transmittance, patch)
+
+    def averaged_over_clusters(self, values: "mi.Color3f") -> "mi.Color3f":
+        """``values`` of all elements, those of clusters replaced by area averages over their patches (Color3f
+        [elements])."""
+        if self.crown:
+            patches = np.array(values).T[: self.patches.count].astype(np.float64)
+            above = dr.arange(mi.UInt32, len(self.crown)) + opaque_index(self.patches.count)
+            dr.scatter(values, owned_vectors(mi.Color3f, self.crown.means(patches)), above)
+        return values
+
     def patch_point(self, element: "mi.UInt32", a: "mi.Float", b: "mi.Float") -> "tuple[mi.Float, mi.Float]":
         """Patch coordinates (u, v) of the element's own coordinates (a, b)."""
         scale = dr.gather(mi.Float, self.scale, element)

@@ -166,8 +166,7 @@ class Pairs:
         pair = Pair(area_i, area_j, e.patches.total_area, e.level(i), e.level(j))
         if radiosity is None:
             return pair
-        rho, B = dr.gather(mi.Color3f, e.reflectance, i), dr.gather(mi.Color3f, radiosity, j)
-        return dataclasses.replace(pair, rho=rho, B=B)
+        return dataclasses.replace(pair, rho=e.albedo(i), B=dr.gather(mi.Color3f, radiosity, j))
 
     def value(self, pairs: "mi.UInt32", radiosity: "mi.Color3f") -> "mi.Float":
         """What the oracle compares with ε, for pairs it has evaluated (Float [n], ≥ 0)."""

@@ -47,10 +47,10 @@ class Vertices:
     def _points(self):
         e, every = self._elements, dr.arange(mi.UInt32, len(self._elements))
         point, first = dr.zeros(mi.Point3f, self.count), dr.full(mi.UInt32, NONE, self.count)
-        for corner in self.corner:
-            dr.scatter_reduce(dr.ReduceOp.Min, first, every, corner, mode=dr.ReduceMode.Direct)
+        for corner in self.corner:  # clusters have none
+            dr.scatter_reduce(dr.ReduceOp.Min, first, every, corner, corner != NONE, mode=dr.ReduceMode.Direct)
         for node, corner in enumerate(self.corner):
-            owns = dr.gather(mi.UInt32, first, corner) == every
+            owns = (corner != NONE) & (dr.gather(mi.UInt32, first, corner, corner != NONE) == every)
             dr.scatter(point, node_point(e, every, node), corner, owns)
         dr.eval(point)
         return point

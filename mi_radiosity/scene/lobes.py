@@ -21,8 +21,8 @@ class Lobes:
     """Follows power rays in a scene some of whose shapes are not plainly diffuse.
 
     At every such surface one lobe is sampled by Mitsuba's `bsdf.sample`, for the transport of importance. A diffuse
-    lobe ends the ray. Its weight over the mean reflectance ρ of the patch multiplies the power that arrives, so that
-    the mean of what the patch receives is what arrives there. Any other lobe sends the ray on.
+    lobe ends the ray, whether it reflects or transmits. Its weight over the mean albedo ρ + τ of the patch multiplies
+    the power that arrives, so that the mean of what the patch receives is what arrives there. Any other lobe sends the ray on.
     """
 
     def __init__(self) -> None:
@@ -72,14 +72,13 @@ class Lobes:
         si = met.compute_surface_interaction(ray, mi.RayFlags.All, alive)
         s, st = random.next_float32(), mi.Point2f(random.next_float32(), random.next_float32())
         sample, value = si.bsdf(ray).sample(ctx, si, s, st, alive)
-        value = dr.select(alive & dr.all(dr.isfinite(value)), value, 0)
+        value = dr.select(alive & is_sound(si, sample, value), value, 0)
 
-        # A diffuse lobe of a patch ends the ray.
-        diffuse = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-        ends = alive & diffuse & on_patch & (dr.max(value) > 0)
+        # A diffuse lobe of a patch ends the ray: what it reflects or transmits, this side has received.
+        ends = alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse) & on_patch & (dr.max(value) > 0)
         on = alive & ~ends
-        rho = dr.gather(mi.Color3f, rays.patches.reflectance, end.patch, ends)
-        factor = dr.select(ends, dr.select(rho > 0, value / rho, 0), dr.select(on, value, 1))
+        albedo = dr.gather(mi.Color3f, rays.patches.albedo, end.patch, ends)
+        factor = dr.select(ends, dr.select(albedo > 0, value / albedo, 0), dr.select(on, value, 1))
         # Sides with a diffuse lobe count all that arrives as received, the others nothing.
         taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
 
@@ -103,6 +102,16 @@ class Lobes:
             taken=end.taken + taken,
         )
         return goes_on & hit.traced, met, ray, depth, random, end
+
+
+def is_sound(si: "mi.SurfaceInteraction3f", sample: "mi.BSDFSample3f", value: "mi.Color3f") -> "dr.ArrayBase":
+    """Are samples of BSDFs finite and of a possible direction (Bool, or one per channel [n])?
+
+    A BlendBSDF that draws a one-sided `diffuse` from behind gives a direction on the front side the weight of its other
+    BSDF, which may transmit. The density of that direction does not include the draw, so the sample is void.
+    """
+    reflects = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
+    return dr.isfinite(value) & ~(reflects & (sample.wo.z * si.wi.z < 0))
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from ..core.points import Stream, kronecker, permuted, stream_seed, triangle
 from .averages import Averages
 from .faces import Faces
 from .lights import LIGHTS
+from .lobes import is_sound
 from .tessellate import UNMESHED, Part, children, parts
 
 DIFFUSE = {"SmoothDiffuse"}
@@ -36,6 +37,9 @@ class Materials:
     normals, of vertices or of a map, are far from the geometric one. ``mixed``: some surfaces have a diffuse lobe and
     others.
 
+    ``tau`` [2 sides, faces, 3]: diffuse transmittance, the share of the irradiance of a side that leaves diffusely from
+    the other side. ``transmits`` [faces]: which faces have a diffuse transmittance greater than 0.
+
     Raises RadiosityError for reflectances that conserve no energy, naming the shape.
     """
 
@@ -56,7 +60,7 @@ class Materials:
         transmits = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Transmission) for s in shapes])
         self._transmitting_faces = owned(mi.UInt32, transmits[faces.shape])
         self.textured = bool((textured & ~self.traced).any())
-        self.rho = np.zeros((2, len(faces), 3))
+        self.rho, self.tau = np.zeros((2, len(faces), 3)), np.zeros((2, len(faces), 3))
         plain = np.flatnonzero(~self.traced[faces.shape])
         varies = (textured & ~self.traced)[faces.shape]
         self._averages, self.varies = Averages(faces, varies), owned(mi.UInt32, varies)
@@ -66,24 +70,32 @@ class Materials:
             for rho, back in zip(self.rho, (False, True)):
                 mean = self.mean_reflectance(face, dr.full(mi.Bool, back, n), zero, zero, one)
                 rho[plain] = np.array(mean, dtype=np.float64).reshape(3, n).T
+        self._transmits = np.array(
+            [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.DiffuseTransmission) for s in shapes], dtype=bool
+        )
         self._find_albedos(textured)
-        faces.refuse(~np.isfinite(self.rho).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
+        albedo = self.rho + self.tau
+        faces.refuse(~np.isfinite(albedo).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         faces.refuse(
-            (self.rho > 1 + ROUNDING).any(axis=(0, 2)),
+            (albedo > 1 + ROUNDING).any(axis=(0, 2)),
             "has a reflectance of more than 1, which makes energy from nothing: make it less than 1",
         )
         tinted = [part.shape.interior_medium() is not None for part in faces.parts]
         if any(tinted):
             where = faces.names(np.array(tinted)[faces.shape])
             faces.warnings.append(f"{where}: the medium inside the glass is not modelled, and taken to be clear")
-        white = self.rho > WHITEST
+        white = albedo > WHITEST
         if white.any():
             where = faces.names(np.asarray(white.any(axis=(0, 2))))
             faces.warnings.append(f"{where}: a reflectance of 1 keeps light for ever, and is taken to be {WHITEST}")
-            self.rho = np.minimum(self.rho, WHITEST)
+            self.tau = np.minimum(self.tau, WHITEST)
+            self.rho = np.minimum(self.rho, WHITEST - self.tau)
+        self.transmits = self.tau.any(axis=(0, 2))
+        albedo = self.rho + self.tau
         # Are there surfaces with a diffuse lobe and others?
-        self.mixed = bool((self.bent | (self.traced[faces.shape] & self.rho.any(axis=(0, 2)))).any())
-        faces.refuse((self.rho < 0).any(axis=(0, 2)), "has a negative reflectance: make it 0 or more")
+        self.mixed = bool((self.bent | (self.traced[faces.shape] & albedo.any(axis=(0, 2)))).any())
+        negative = ((self.rho < 0) | (self.tau < 0)).any(axis=(0, 2))
+        faces.refuse(negative, "has a negative reflectance: make it 0 or more")
 
     def mean_reflectance(
         self, face: "mi.UInt32", back: "mi.Bool", u0: "mi.Float", v0: "mi.Float", scale: "mi.Float"
@@ -119,7 +131,7 @@ class Materials:
         return dr.gather(mi.UInt32, self._transmitting_faces, face, active) != 0
 
     def _find_albedos(self, textured):
-        """ρ of shapes whose other lobes are traced: once per shape, or per face where it varies."""
+        """ρ and τ of shapes whose other lobes are traced: once per shape, or per face where they vary."""
         shape = self._faces.shape
         first = np.searchsorted(shape, np.arange(len(self.traced)))
         solid = np.flatnonzero(self.traced & ~textured & np.isin(np.arange(len(self.traced)), shape))
@@ -127,25 +139,28 @@ class Materials:
         each = max(LEAST, min(SOLID_SAMPLES, MANY // max(len(various), 1)))
         for faces, samples, spread in ((first[solid], SOLID_SAMPLES, True), (various, each, False)):
             for part in np.array_split(faces, len(faces) * samples // AT_ONCE + 1):
-                for rho, side in zip(self._albedos(part, samples), self.rho):
-                    if spread:
-                        for face, value in zip(part, rho):
-                            side[shape == shape[face]] = value
-                    else:
-                        side[part] = rho
+                for side, (rho, tau) in enumerate(self._albedos(part, samples)):
+                    for table, values in ((self.rho[side], rho), (self.tau[side], tau)):
+                        if spread:
+                            for face, value in zip(part, values):
+                                table[shape == shape[face]] = value
+                        else:
+                            table[part] = values
 
     def _albedos(self, faces, samples):
-        """E[w; diffuse] of BSDFs on both sides of faces (two [faces, 3])."""
+        """ρ and τ of BSDFs on both sides of faces ([2 sides, 2, faces, 3])."""
         front = self._albedo(faces, samples, 1)
         alike = self._alike[self._faces.shape[faces]]
         back, other = np.where(alike[:, None], front, 0), self.two_sided[faces] & ~alike
-        back[other] = self._albedo(faces[other], samples, -1)
+        back[:, other] = self._albedo(faces[other], samples, -1)
         return front, back
 
     def _albedo(self, faces, samples, side):
-        """The same on the front, or the back if ``side`` is −1: at random points, for cosine-distributed directions."""
+        """E[w; diffuse, reflected] and E[w; diffuse, transmitted] of BSDFs on the front of faces, or on the back if
+        ``side`` is −1: at random points, for cosine-distributed directions ([2, faces, 3])."""
+        found = np.zeros((2, len(faces), 3))
         if not len(faces):
-            return np.zeros((0, 3))
+            return found
         each = opaque_index(samples)
         k = dr.arange(mi.UInt32, len(faces) * samples)
         face = dr.gather(mi.UInt32, owned(mi.UInt32, faces), k // each)
@@ -159,10 +174,15 @@ class Materials:
         wi = mi.warp.square_to_cosine_hemisphere(mi.Point2f(s, t))
         si.wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
         sample, value = si.bsdf().sample(mi.BSDFContext(), si, a, mi.Point2f(b, c))
-        drawn = mi.has_flag(sample.sampled_type, mi.BSDFFlags.DiffuseReflection)
-        value = dr.select(drawn & dr.isfinite(value), value, 0)
-        dr.eval(value)  # in one go: sums one by one would draw all again
-        return np.array([dr.block_sum(x, samples) for x in value], dtype=np.float64).T / samples
+        kinds = [mi.BSDFFlags.DiffuseReflection]
+        if self._transmits[self._faces.shape[faces]].any():
+            kinds.append(mi.BSDFFlags.DiffuseTransmission)
+        sound = is_sound(si, sample, value)
+        lobes = [dr.select(mi.has_flag(sample.sampled_type, kind) & sound, value, 0) for kind in kinds]
+        dr.eval(lobes)  # in one go: sums one by one would draw all again
+        for total, lobe in zip(found, lobes):
+            total[:] = np.array([dr.block_sum(x, samples) for x in lobe], dtype=np.float64).T / samples
+        return found
 
     def reflectance_at(self, face: "mi.UInt32", u: "mi.Float", v: "mi.Float", back: "mi.Bool") -> "mi.Color3f":
         """ρ at points of faces, on the back side where ``back`` (Bool). Returns Color3f [n]."""

@@ -92,6 +92,7 @@ class Model:
         emits = self.lights.exitance.any(axis=1)[:, None] & [True, False]
         # A side without a diffuse lobe receives nothing: what meets it goes on.
         lobe = ~self.materials.traced[f.shape][:, None] | self.materials.rho.any(axis=2).T | emits
+        lobe |= self.materials.transmits[:, None]
         self._candidate = there & lobe if self.lights.required else there
         exitance = self.lights.exitance.sum(axis=1)
         return find_overlaps(
@@ -122,7 +123,8 @@ class Model:
     def fingerprint(self) -> str:
         digest, f = hashlib.sha256(), self.faces
         order, rho = f.order, np.round(self.materials.rho, 4).swapaxes(0, 1) + 0
-        for array in (f.corners, f.flipped, self.materials.two_sided, rho, self.lights.exitance):
+        tau = [np.round(self.materials.tau, 4).swapaxes(0, 1)] if self.materials.transmits.any() else []
+        for array in (f.corners, f.flipped, self.materials.two_sided, rho, *tau, self.lights.exitance):
             digest.update(np.ascontiguousarray(array[order], dtype=np.float32).tobytes())
         for named in self._named:
             digest.update(bytes(named))

@@ -34,6 +34,8 @@ class Patches:
     normal: "mi.Vector3f"  # unit, towards the side
     area: "mi.Float"  # m²
     reflectance: "mi.Color3f"  # ρ, mean over the patch
+    # τ, the share of the irradiance that leaves diffusely from the other side of the face; None if no face transmits
+    transmittance: "mi.Color3f | None"
     emission: "mi.Color3f"  # E = π L_e, W/m²
     origin: "mi.Point3f"
     lift: "mi.Float"  # by which rays start off a surface, m
@@ -55,11 +57,51 @@ class Patches:
         def pick(column):
             return dr.gather(type(column), column, chosen)
 
-        columns = ("face", "back", "p0", "e1", "e2", "normal", "area", "reflectance", "emission")
-        picked: dict = {name: pick(getattr(self, name)) for name in columns}
+        columns = ("face", "back", "p0", "e1", "e2", "normal", "area", "reflectance", "emission", "transmittance")
+        known = {name: getattr(self, name) for name in columns}
+        picked: dict = {name: pick(column) for name, column in known.items() if column is not None}
         picked["corners"] = [pick(corner) for corner in self.corners]
         dr.eval(picked)
         return replace(self, count=len(rows), sides=self.sides[rows], **picked)
+
+    @cached_property
+    def albedo(self) -> "mi.Color3f":
+        """ρ + τ, the share of the irradiance that leaves diffusely on either side of the face (Color3f [patches])."""
+        if self.transmittance is None:
+            return self.reflectance
+        albedo = self.reflectance + self.transmittance
+        dr.eval(albedo)
+        return albedo
+
+    @cached_property
+    def twin(self) -> "np.ndarray | None":
+        """The patch on the other side of each face that transmits diffusely, NONE for the others (int [patches]); None
+        if no patch has such a twin."""
+        if self.transmittance is None:
+            return None
+        row = np.full(2 * (int(self.sides.max()) // 2) + 2, -1)
+        row[self.sides] = np.arange(self.count)
+        other, tau = row[self.sides ^ 1], np.array(self.transmittance).reshape(3, -1)
+        transmits = tau.max(axis=0) > 0
+        there = (other >= 0) & (transmits | transmits[other])
+        return np.where(there, other, NONE) if there.any() else None
+
+    @cached_property
+    def _twins(self):
+        """`twin` on the device."""
+        return owned(mi.UInt32, self.twin)
+
+    def behind(
+        self, patch: "mi.UInt32", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.UInt32, mi.Color3f, mi.Bool] | None":
+        """What transmits light to patches: the twin of each patch, τ of the twin, and whether there is a twin (UInt32,
+        Color3f, Bool [n]); None if no patch has a twin."""
+        if self.twin is None:
+            return None
+        twin = dr.gather(mi.UInt32, self._twins, patch, active)
+        there = active & (twin != NONE)
+        twin = dr.select(there, twin, 0)
+        return twin, dr.gather(mi.Color3f, self.transmittance, twin, there), there
 
     @cached_property
     def total_area(self) -> float:
@@ -83,6 +125,7 @@ def make_patches(faces: Faces, materials: Materials, lights: Lights, sides: np.n
         normal=owned_vectors(mi.Vector3f, faces.normal[face] * sign),
         area=owned(mi.Float, faces.area[face]),
         reflectance=owned_vectors(mi.Color3f, materials.rho[back, face]),
+        transmittance=owned_vectors(mi.Color3f, materials.tau[back, face]) if materials.transmits.any() else None,
         emission=owned_vectors(mi.Color3f, np.where(emits, lights.exitance[face], 0)),
         origin=mi.Point3f(*(dr.opaque(mi.Float, c) for c in faces.centre)),
         lift=dr.opaque(mi.Float, faces.lift),

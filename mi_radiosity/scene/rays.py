@@ -53,7 +53,7 @@ class Rays:
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
         p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
-        named = [self._first_face, self.front, self._patch_of, *self._materials.arrays(), p.emission, p.reflectance]
+        named = [self._first_face, self.front, self._patch_of, *self._materials.arrays(), p.emission, p.albedo]
         # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
         return [self.scene, self.scene.shapes_dr(), *named, *overlaps]
 

@@ -29,6 +29,8 @@ def reached(rays: Rays, lights: Lights, paths: LightPaths) -> np.ndarray:
     patches = rays.patches
     emits = np.array(dr.max(patches.emission) > 0).astype(bool)
     lit, links = emits | paths.lit, []
+    if patches.twin is not None:  # light on one side of a face that transmits is light on the other side
+        links.append((np.arange(patches.count), patches.twin))
     dark = np.arange(patches.count)
     probes = max(4 * GLANCES, min(PROBES, MOST_PROBES // patches.count))
     glances = PROBES if patches.count <= FEW else GLANCES

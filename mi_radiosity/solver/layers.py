@@ -157,13 +157,12 @@ def powers(problem: Problem, flow: Flow) -> np.ndarray:
 
 
 def _absorbed(problem, irradiance):
-    """(1 − ρ) H A of all leaves, W [3]."""
+    """(1 − ρ) H A of all leaves less what the other sides of faces transmit to them, W [3]."""
     leaves, elements = problem.elements.leaves, problem.elements
     kept = 1 - dr.gather(mi.Color3f, elements.reflectance, leaves)
-    absorbed = (
-        kept * dr.gather(mi.Color3f, irradiance, leaves) * dr.gather(mi.Float, problem.exposure.open_area, leaves)
-    )
-    return np.array(totals([mi.Float64(a) for a in absorbed]))
+    received, area = dr.gather(mi.Color3f, irradiance, leaves), dr.gather(mi.Float, problem.exposure.open_area, leaves)
+    passed = problem.scattering.transmitted_to_leaves(received) * area
+    return np.array(totals([mi.Float64(a) - mi.Float64(p) for a, p in zip(kept * received * area, passed)]))
 
 
 def _lit(elements, lamps, model, scales):

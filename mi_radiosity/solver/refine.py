@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..core.arrays import NONE, concat, opaque_index, owned_vectors
+from ..core.arrays import NONE, concat, opaque_index
 from ..core.points import Stream, stream_seed
 from ..mesh import MAX_LEVEL, Clusters, Exposure, Pairs, Tree
 from ..scene import Model
@@ -112,11 +111,8 @@ class Refinement:
         self.rays += flow.rays
         self.first_share = flow.first_share
         every = dr.arange(mi.UInt32, len(elements))
-        self._radiosity = elements.emission(every) + elements.reflectance * (flow.direct + flow.indirect)
-        if crown := elements.crown:
-            patches = np.array(self._radiosity).T[: elements.patches.count].astype(np.float64)
-            above = dr.arange(mi.UInt32, len(crown)) + opaque_index(elements.patches.count)
-            dr.scatter(self._radiosity, owned_vectors(mi.Color3f, crown.means(patches)), above)
+        scattered = problem.scattering.of_elements(flow.direct + flow.indirect)
+        self._radiosity = elements.averaged_over_clusters(elements.emission(every) + scattered)
         dr.eval(self._radiosity)
         self._hits = _with_roots(_joined(flow.records), self._pairs)
 

@@ -19,7 +19,7 @@ from ..core.errors import RadiosityError
 from ..core.files import writing
 from ..core.llvm import require_variant
 from ..core.numbers import real_number, whole_number
-from ..mesh import Elements, Exposure
+from ..mesh import Elements, Exposure, Scattering
 from ..mesh.crown import Crown
 from ..mesh.elements import mean_exitance
 from ..mesh.subdivision import NODES
@@ -118,17 +118,16 @@ class Solution:
 
     def radiosity(self, points: ArrayLike | None = None, normals: ArrayLike | None = None) -> "np.ndarray | mi.Color3f":
         """B = E + ρ H, W/m², of the continuous field on the surface nearest to each point (NumPy [n, 3]); NaN for
-        points farther from all than 1 % of the scene's diagonal.
+        points farther from all than 1 % of the scene's diagonal. Where a face transmits diffusely, τ H of its other
+        side is added.
 
         points [n, 3] in m; normals [n, 3], of any length: which side of a surface is meant; by default the front, or
         the back if light reaches only that. Without points: B of all elements (Color3f [elements]).
         Raises RadiosityError for points or normals that are not finite, or do not fit together.
         """
         if points is None:
-            return (
-                self.elements.emission(dr.arange(mi.UInt32, len(self.elements)))
-                + self.elements.reflectance * self.irradiance()
-            )
+            every = dr.arange(mi.UInt32, len(self.elements))
+            return self.elements.emission(every) + self.scattering.of_elements(self.irradiance())
         where, given = _checked_points(points, (0, 0, 1) if normals is None else normals)
         if len(where) == 0:
             return np.zeros((0, 3))
@@ -158,7 +157,17 @@ class Solution:
         leaf = self.elements.leaf_at(patch, hit.u, hit.v, lit)
         emission = self.model.lights.at(patches, patch, hit.u, hit.v, lit)
         reflectance = self.model.reflectance_at(patch, hit.u, hit.v, lit)
-        return dr.select(lit, emission + reflectance * self.field.at(leaf, hit.u, hit.v, lit), 0)
+        light = emission + reflectance * self.field.at(leaf, hit.u, hit.v, lit)
+        if (behind := patches.behind(patch, lit)) is not None:
+            twin, tau, there = behind
+            leaf = self.elements.leaf_at(twin, hit.u, hit.v, there)
+            light += tau * dr.select(there, self.field.at(leaf, hit.u, hit.v, there), 0)
+        return dr.select(lit, light, 0)
+
+    @cached_property
+    def scattering(self) -> Scattering:
+        """What of the irradiance leaves the elements diffusely."""
+        return Scattering(self.elements, self.exposure)
 
     @cached_property
     def field(self) -> Field:
@@ -168,8 +177,9 @@ class Solution:
     @cached_property
     def gatherer(self) -> Gatherer:
         """What gathers irradiance at any places, by this solution's radiosity."""
-        light = self.irradiance() if self.sharp is None else self.irradiance() - self.sharp
-        reflected = self.elements.reflectance * light
+        light = self.direct + self.indirect
+        # Gather rays look for sharp light where they end, but only for the part that is reflected there.
+        reflected = self.scattering.of_elements(light if self.sharp is None else light - self.sharp, light)
         looks = self.sharp is not None
         return Gatherer(self.model, self.elements, self.exposure, self.landings, reflected, looks, self.sharp)
 

@@ -195,7 +195,7 @@ def _warnings(elements, rays, caustic, flows):
     if caustic is not None and dr.any(caustic > 0, axis=None):
         found.append(
             "light of lamps that are no surfaces comes through glass or off mirrors: it is shown as sharp as elements "
-            "are, only known of surfaces, and not found by 'path' at all"
+            "are, and only known of surfaces"
         )
     return found
 

@@ -102,7 +102,8 @@ class _Pass:
     def look_around(self, flow: Flow, known: Known) -> Flow:
         """``flow`` with its irradiance replaced by what the leaves gather in the room, and have found of the lamps."""
         e, exposure = self._problem.elements, self._problem.exposure
-        reflected = e.reflectance * (pull(e, known.direct, exposure.open_area) + flow.indirect)
+        scattering = self._problem.scattering
+        reflected = scattering.of_elements(pull(e, known.direct, exposure.open_area) + flow.indirect)
         self._gatherer = self._gatherer.seeing(reflected, known.landings.filled_by(flow.landings))
         most = self._most_from_lamps() + dr.max(flow.direct + flow.indirect, axis=None)[0]
         glow = ColorSums(len(self._lines), [1e5 * most * int(self._lines.max())] * 3)
@@ -124,14 +125,15 @@ class _Pass:
         Sharp light is what they look for where they end."""
         e = self._problem.elements
         leaves, rows = e.leaves, dr.arange(mi.UInt32, len(self._lines))
-        rho, shone = _of(e.reflectance, leaves), glow.gather(rows)
+        shone, scattering = glow.gather(rows), self._problem.scattering
         direct, sharp = (mi.Color3f(*map(mi.Float, light)) for light in (direct, sharp))
         seen = direct - sharp + (0 if flow.caustic is None else _of(flow.caustic, leaves))
 
         def bounce(light):
-            """Indirect light that comes of light on the leaves (3 Float64 ─► 3 Float64 [leaves])."""
+            """Indirect light that comes of light on the leaves (Color3f [leaves] ─► 3 Float64 [leaves]). Shadow rays
+            find the sharp light that is reflected, but not the sharp light that is transmitted."""
             reflected = dr.zeros(mi.Color3f, len(e))
-            dr.scatter(reflected, rho * light, leaves)
+            dr.scatter(reflected, scattering.of_leaves(light, light + sharp), leaves)
             dr.eval(reflected)
             indirect = self._averaged([g + s / RAYS_PER_LINE for g, s in zip(shone, links.sums(reflected))])
             dr.eval(indirect)
@@ -186,11 +188,17 @@ class _Pass:
         e, exposure = self._problem.elements, self._problem.exposure
         area = mi.Float64(dr.gather(mi.Float, exposure.open_area, e.leaves))
         kept = [area * (1 - mi.Float64(r)) for r in dr.gather(mi.Color3f, e.reflectance, e.leaves)]
+
+        def absorbed(light):
+            """Power that the leaves keep, W: (1 − ρ) H A less what the other side transmits to them."""
+            passed = self._problem.scattering.transmitted_to_leaves(light)
+            return totals([h * k - mi.Float64(t) * area for h, k, t in zip(light, kept, passed)])
+
         nothing = dr.zeros(mi.Color3f, len(e))
         added = nothing, nothing if flow.caustic is None else flow.caustic
-        have = [totals([h * k for h, k in zip(light, kept)]) for light in (direct, indirect)]
+        have = [absorbed(light) for light in (direct, indirect)]
         want = [
-            totals([mi.Float64(h) * k for h, k in zip(dr.gather(mi.Color3f, light - more, e.leaves), kept)])
+            absorbed([mi.Float64(h) for h in dr.gather(mi.Color3f, light - more, e.leaves)])
             for light, more in zip((flow.direct, flow.indirect), added)
         ]
         if self._problem.model.rays.lobes is not None:  # how much of the light goes straight is known to chance only

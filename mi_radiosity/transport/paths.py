@@ -2,8 +2,9 @@
 
 Every vertex evaluates Mitsuba's own BSDF f in Mitsuba's own shading frame: one shadow ray to an area emitter, one to
 each other emitter, and one continuation by `bsdf.sample`, weighted by the power heuristic (Veach 1997, eq. 9.13). The
-cache holds, for every element, the exitance ρ H of its diffuse lobe. As f = ρ/π + (f − ρ/π) for any ρ, a path that
-reads the cache at a vertex goes on from there with f − ρ/π in the place of f, and nothing is lost or counted twice.
+cache holds, for every element, the exitance ρ H of its diffuse lobe, and τ H of the other side where a face transmits
+diffusely. As f = ρ/π + (f − ρ/π) for any ρ, a path that reads the cache at a vertex goes on from there with f − ρ/π in
+the place of f (f − τ/π to the other side), and nothing is lost or counted twice.
 """
 
 from collections.abc import Callable, Sequence
@@ -161,7 +162,10 @@ class Paths:
         # What the cache has of the BSDF is taken from it.
         hit, leaf = vertex.hit, vertex.leaf
         rho = self._reflectance(leaf, hit.patch, hit.u, hit.v, alive & vertex.cached)
-        lobe = _Residual(bsdf, si, dr.select(vertex.cached, rho, 0))
+        behind, tau = model.patches.behind(hit.patch, alive & vertex.cached), mi.Color3f(0)
+        if behind is not None:
+            _, tau, _ = behind
+        lobe = _Residual(bsdf, si, dr.select(vertex.cached, rho, 0), tau)
 
         # Next-event estimation, and what no path can find.
         light = self._from_area(lobe, si, leaf, lot, s, t, random, alive) + self._from_others(lobe, si, s, t, alive)
@@ -289,13 +293,15 @@ class Paths:
 
 
 class _Residual:
-    """A BSDF without the Lambertian lobe that is in the cache, in the shading frame: f cos θ − ρ/π cos θ."""
+    """A BSDF without the Lambertian lobes that are in the cache, in the shading frame: (f − ρ/π) |cos θ| on the side
+    of the path, (f − τ/π) |cos θ| on the other side."""
 
-    def __init__(self, bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", rho: "mi.Color3f") -> None:
-        self._bsdf, self._si, self._rho, self._context = bsdf, si, rho, mi.BSDFContext()
+    def __init__(self, bsdf: "mi.BSDFPtr", si: "mi.SurfaceInteraction3f", rho: "mi.Color3f", tau: "mi.Color3f") -> None:
+        self._bsdf, self._si, self._context = bsdf, si, mi.BSDFContext()
+        self._rho, self._tau = rho, tau
 
     def _lambert(self, wo):
-        return self._rho * dr.select(self._si.wi.z * wo.z > 0, dr.abs(wo.z) * dr.inv_pi, 0)
+        return dr.select(self._si.wi.z * wo.z > 0, self._rho, self._tau) * dr.abs(wo.z) * dr.inv_pi
 
     def eval_pdf(self, wo: "mi.Vector3f", active: "mi.Bool") -> "tuple[mi.Color3f, mi.Float]":
         """Its value times cos θ, and the density of `sample`, 1/sr (Color3f, Float [n])."""

@@ -1,10 +1,11 @@
 """What a transport is given, and what it leaves behind."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import mitsuba as mi
 
-from ..mesh import Clusters, Elements, Exposure, Pairs
+from ..mesh import Clusters, Elements, Exposure, Pairs, Scattering
 from ..scene import Model
 from .landings import Landings
 
@@ -19,6 +20,11 @@ class Problem:
     exposure: Exposure
     known: "Known | None" = None
     clusters: Clusters | None = None  # leaves that share one irradiance, if any do
+
+    @cached_property
+    def scattering(self) -> Scattering:
+        """What of the irradiance leaves the elements diffusely."""
+        return Scattering(self.elements, self.exposure)
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,8 @@ class Shooting(Transport):
     """Shoots all power with rays that leave it at pairs (`deposit`), iteration after iteration.
 
     B = E + ρ H is summed as the Neumann series Σ_k H_k of irradiances (eq. 1). Iteration k shoots the power
-    ρ H_(k−1) A that is unshot, with rays in proportion to it (`LeafEmitter`).
+    ρ H_(k−1) A that is unshot, with rays in proportion to it (`LeafEmitter`). Where faces transmit diffusely, ρ H is
+    ρ_a H_a + τ_b H_b of their sides (`Scattering`).
 
     The lamps get ``first_share`` of the rays. With λ the share of power that survives an iteration, every later one
     takes 1 − λ of the rays left, so that all rays carry about the same power. Once less than ``tail`` of the power is
@@ -83,7 +84,6 @@ class _Series:
         self.how, self.problem, self.seed, self.rays = how, problem, seed, rays
         elements, area = problem.elements, problem.exposure.open_area
         self.area = mi.Float64(dr.gather(mi.Float, area, elements.leaves))
-        self.reflectance = [mi.Float64(r) for r in dr.gather(mi.Color3f, elements.reflectance, elements.leaves)]
         self.power = [mi.Float64(e) * self.area for e in elements.emission(elements.leaves)]
         self.lamps = [(LampEmitter(light), list(light.power())) for light in problem.model.lights.free]
         self.on_surfaces = totals(self.power)
@@ -112,7 +112,7 @@ class _Series:
             straight = received if direct is None else self._received(direct, scale)
             self.direct = self._better(straight)
             received = [h - a + b for h, a, b in zip(received, straight, self.direct)]
-        self.power = [h * r * self.area for h, r in zip(received, self.reflectance)]
+        self.power = [b * self.area for b in self.problem.scattering.of_leaves(received)]
         after = totals(self.power)
         closes = self.left == 0
         closure = [1 / max(1 - a / u, 1e-6) if closes and u > 0 else 1.0 for a, u in zip(after, self.unshot)]

@@ -39,6 +39,7 @@ async function load() {
     const index = arrays.triangles, corners = index.length;
     const light = (name) => data.layers.map((layer, k) => halves(arrays[`${name}${k}`], data.light));
     const smooth = light("layer"), flat = light("leaf_layer");
+    const transmits = "through0" in arrays, through = (name) => (transmits ? light(name) : []);
     const reflectance = Float32Array.from(arrays.reflectance, (x) => x / 65535), emission = halves(arrays.emission, data.light);
 
     const spread = (values, items, of) => {
@@ -56,6 +57,8 @@ async function load() {
         emission: spread(emission, 3, vertex),
         smooth: { layers: smooth, of: vertex }, // of vertices, and of leaves
         flat: { layers: flat, of: leaf },
+        // Light that comes through from the other side of faces, W/m².
+        through: { smooth: { layers: through("through"), of: vertex }, flat: { layers: through("leaf_through"), of: leaf } },
         uv: arrays.uv ? spread(Float32Array.from(arrays.uv, (x) => x / 65535), 2, vertex) : new Float32Array(2 * corners),
         inner: new Float32Array(3 * corners), // 1 for the sides of a triangle within its leaf
     };
@@ -82,7 +85,7 @@ precision highp float;
 in vec3 H, rho, E, side, within;
 in vec2 st;
 out vec4 color;
-uniform float exposure, shines, most;
+uniform float exposure, most;
 uniform bool outlines, lux, textured;
 uniform vec3 luminous, stops[6];
 uniform sampler2D map;
@@ -97,7 +100,7 @@ void main() {
         color = vec4(mix(stops[k], stops[k + 1], share - float(k)), 1.0);
         return;
     }
-    vec3 L = (shines * E + (textured ? texture(map, st).rgb : rho) * H) / ${Math.PI};
+    vec3 L = (E + (textured ? texture(map, st).rgb : rho) * H) / ${Math.PI};
     if (outlines) {
         vec3 away = side / max(fwidth(side), vec3(1e-9)) + 1e9 * within;
         L *= mix(1.0, 0.25, clamp(1.0 - min(away.x, min(away.y, away.z)), 0.0, 1.0));
@@ -108,7 +111,7 @@ void main() {
 const STOPS = [[0.04, 0.03, 0.15], [0.32, 0.07, 0.48], [0.72, 0.21, 0.47], [0.97, 0.45, 0.33], [0.99, 0.78, 0.4], [1, 1, 0.85]];
 
 const uniforms = {
-    exposure: { value: data.exposure }, shines: { value: 1 }, most: { value: 1 }, outlines: { value: false }, lux: { value: false },
+    exposure: { value: data.exposure }, most: { value: 1 }, outlines: { value: false }, lux: { value: false },
     luminous: { value: new THREE.Vector3(...data.luminous) }, stops: { value: STOPS.flat() },
 };
 
@@ -142,6 +145,7 @@ function weights(mode) {
 
 /** The weighted sum of layers, spread over the corners. */
 function sum({ layers, of }, factors, result) {
+    if (layers.length === 0) return result.fill(0);
     const total = new Float32Array(layers[0].length);
     layers.forEach((layer, k) => {
         if (factors[k].some(Boolean)) for (let i = 0; i < total.length; i++) total[i] += factors[k][i % 3] * layer[i];
@@ -150,11 +154,11 @@ function sum({ layers, of }, factors, result) {
         for (let c = 0, from = 3 * of(i); c < 3; c++) result[3 * i + c] = total[from + c];
 }
 
-/** What the lamps themselves emit. */
+/** Adds what the emitters emit. */
 function shine(mesh, result) {
     for (const { start, count, lamp } of data.parts) {
         const scale = scaleOf(lamp);
-        for (let i = 3 * start; i < 3 * (start + count); i++) result[i] = scale[i % 3] * mesh.emission[i];
+        for (let i = 3 * start; i < 3 * (start + count); i++) result[i] += scale[i % 3] * mesh.emission[i];
     }
 }
 
@@ -328,12 +332,16 @@ function trace(mesh, origin, way) {
 const digits = (x) => (x === 0 ? "0" : x >= 1000 ? Math.round(x).toLocaleString() : x.toPrecision(3));
 
 function reading(mesh, hit) {
-    const { layers, of } = mesh.smooth, factors = weights("shaded");
+    const factors = weights("shaded");
     const at = (values, place = (i) => i) =>
         [0, 1, 2].map((c) => hit.weights.reduce((s, w, k) => s + w * values[3 * place(hit.corner + k) + c], 0));
-    const light = layers.map((layer) => at(layer, of)), H = [0, 1, 2].map((c) => light.reduce((s, x, k) => s + factors[k][c] * x[c], 0));
+    const total = ({ layers, of }) => {
+        const light = layers.map((layer) => at(layer, of));
+        return [0, 1, 2].map((c) => light.reduce((s, x, k) => s + factors[k][c] * x[c], 0));
+    };
+    const H = total(mesh.smooth), through = total(mesh.through.smooth);
     const part = data.parts.find((p) => hit.corner >= p.start && hit.corner < p.start + p.count), scale = scaleOf(part.lamp);
-    const rho = at(mesh.reflectance), E = at(mesh.emission), B = H.map((h, c) => scale[c] * E[c] + rho[c] * h);
+    const rho = at(mesh.reflectance), E = at(mesh.emission), B = H.map((h, c) => scale[c] * E[c] + rho[c] * h + through[c]);
     const lux = H.reduce((s, h, c) => s + h * data.luminous[c], 0);
     const three = (x) => x.map(digits).join("  ");
     const lines = [`${digits(lux)} lx`, `irradiance  ${three(H)}  W/m²`];
@@ -404,13 +412,14 @@ async function main() {
     function relight() {
         stale = false;
         const name = mode.value;
-        sum(name === "flat" ? mesh.flat : mesh.smooth, weights(name), light);
-        shine(mesh, emission);
+        const kind = name === "flat" ? "flat" : "smooth";
+        sum(mesh[kind], weights(name), light);
+        sum(mesh.through[kind], weights(name), emission);
+        if (name !== "indirect") shine(mesh, emission);
         for (const changing of ["light", "emission"]) geometry.attributes[changing].needsUpdate = true;
         read();
         uniforms.outlines.value = name === "mesh";
         uniforms.lux.value = name === "lux";
-        uniforms.shines.value = Number(name !== "indirect");
         uniforms.most.value = data.most;
         element("scale").style.display = name === "lux" ? "block" : "none";
     }
