@@ -239,7 +239,7 @@ class Infinite(Free):
         place = dr.select(first, mi.Vector3f(near.x, s, t), mi.Vector3f(t, near.y, s))
         place = dr.select(second, place, mi.Vector3f(s, t, near.z))
         pad = 2.0**-10 * dr.norm(size)
-        return mi.Point3f(low + place * size) + towards * pad, -towards, radiance * outline
+        return mi.Point3f(low + place * size + towards * pad), -towards, radiance * outline
 
 
 class DirectionalArea(Free):

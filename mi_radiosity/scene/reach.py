@@ -82,6 +82,8 @@ def _cast(rays, patch, number):
         patch = dr.select(hit != NONE, hit, patch)
         origin, direction, carries = pass_on(rays, origin, direction, w, x, s, t)
         on = dr.compress(carries)
+        if dr.width(on) == 0:
+            break
         origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
         patch, number = (dr.gather(mi.UInt32, x, on) for x in (patch, number))
     return links, np.concatenate(escaped)
