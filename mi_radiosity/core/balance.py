@@ -19,11 +19,11 @@ def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarr
     An exponential on both sides would let one entry of large variance explode where a sure row needs a large y.
 
     matrix: X, symmetric and ≥ 0 (SciPy CSR [n, n]); weight: w of its entries, symmetric: variance over value;
-    outside, give: O and v [k, n]; sums: s ≥ 0 [n]. X' is symmetric and ≥ 0, and keeps zeros; entries change in
-    proportion to their variance, which to first order is the least change in units of their errors. y minimises the
-    convex function whose gradient is the excess of the sums, by Newton's method. Returns the data of X', and O'. Rows that are empty, or whose
-    sum is 0, stay as they are; the best y met is used where none fits, as with two facets of different size that see
-    nothing but each other.
+    outside, give: O and v [k, n]; sums: s ≥ 0 [n]. X' is symmetric and ≥ 0, and keeps zeros. Entries change by their
+    variance times y_i + y_j, which to first order is the least change in units of their errors. y minimises the convex
+    function whose gradient is the excess of the sums, by Newton's method. Returns the data of X', and O'. Rows that are
+    empty, or whose sum is 0, stay as they are. The best y found is used where none fits, as with two facets of
+    different size that see nothing but each other.
     """
     linalg = optional("scipy.sparse.linalg", "the closing of view factors", "factors")
     least = LEAST * sums.max(initial=0)

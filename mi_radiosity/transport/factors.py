@@ -19,7 +19,10 @@ from .sample_lines import LINES, visible_sums
 
 RAYS = {"shape": 1 << 17, "face": 1 << 10, "leaf": 1 << 10}  # per row, by default
 FEW = 8  # rays that connect two cells from which sample lines are worth their cost
-RAMP = 16, 64  # expected rays between two cells: below the first, rays alone decide; from the second, sample lines alone
+RAMP = (
+    16,
+    64,
+)  # expected rays between two cells: below the first, rays alone decide; from the second, sample lines alone
 UNSEEN = 2  # rays or sample lines that every error allows for beyond the observed ones (Agresti and Coull)
 
 
@@ -38,9 +41,11 @@ class ViewFactors:
     """View factors between the facets of a scene.
 
     F: [rows, columns], SciPy CSR; column j < rows is facet j, and any further ones are, in this order and where rays
-    end there: "sky", "ground", and "backs", sides that have no material. error: standard errors, in the same places;
-    where F has no entry it is below some 3 / rays. names: of the columns. areas: of the facets, without what lies under
-    others or inside solids, m² [rows]. closure: what was adjusted. stats: rays, lines, seconds.
+    end there: "sky", "ground", and "backs", sides that have no material. error: standard errors, in the same places: at
+    least 95 % of the entries lie within two of them. Where F has no entry, no ray connected the two facets: it is below
+    3 / rays in 95 % of such cases, rays being those of the row that start on its visible area. names: of the columns.
+    areas: visible areas of the facets, without what lies under others or inside solids, m² [rows]. closure: what was
+    adjusted. stats: rays, lines, seconds.
     """
 
     F: Any
@@ -97,9 +102,9 @@ def view_factors(
     facet, 1,024 by default, and 131,072 from shapes. up: what tells the sky from the ground. progress: called with
     (stage, done, total).
 
-    Where few rays connect two faces (or leaves) their number is the estimate; where many do, it is their exchange area
-    in full view, by contour integrals, times the share of as many lines between them that nothing blocks, weighted by
-    the kernel. Raises RadiosityError for options and scenes that cannot be used.
+    Where few rays connect two faces (or leaves), the share of rays that connect them is the estimate. Where many do,
+    the estimate is the exchange area in full view, by contour integrals, times the visible share of sample lines that
+    are distributed like the kernel. Raises RadiosityError for options and scenes that cannot be used.
     """
     start = time.perf_counter()
     rays = RAYS.get(level, 1) if rays is None else rays
@@ -159,11 +164,11 @@ class _Exchange:
         self.area = like(self.area, area)
 
     def _refine(self, chosen, seed):
-        """Replace the ray estimates of pairs i < j by those of sample lines, where enough rays are to be expected.
+        """Replace the ray estimates of pairs i < j by those of sample lines, where enough rays are expected.
 
-        There are as many lines as rays would connect the cells in full view. The ratio Σ k V / Σ k is the visible share.
-        The weight of each half of the lines depends on the other half only: a weight that depended on the estimate
-        itself would shift its mean.
+        There are as many lines as rays would connect the cells in full view. Σ k V / Σ k is the visible share. The
+        weight of each half of the lines depends on the other half only: a weight that depended on the estimate itself
+        would shift its mean.
         """
         i, j = self._of[chosen], self.area.indices[chosen]
         whole, both = exchange_area(self.facets.corners[i], self.facets.corners[j]), self.density[i] + self.density[j]

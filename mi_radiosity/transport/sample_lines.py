@@ -26,7 +26,7 @@ def visible_sums(
     """Σ k, Σ k², Σ k V and Σ k² V over the sample lines of pairs of cells, by halves (float64 [4, 2, pairs]).
 
     i, j: cells [pairs]; whole: their exchange areas in full view, m² [pairs]; blocks: of LINES lines each, an even
-    number [pairs]. k is the kernel over the density of the line, in units of its mean; V is 1 for visible lines, else 0.
+    number [pairs]. k is the kernel over the density of the line, in units of its mean. V is 1 for visible lines.
 
     One end of a line is uniform on the smaller cell, the other end is uniform in the solid angle of the larger cell.
     So k = A Ω cos θ / (π · whole) is bounded, also where cells touch and the kernel itself is singular.
@@ -40,8 +40,8 @@ def visible_sums(
     for start in range(0, len(pair), most):
         part = slice(start, start + most)
         of = pair[part]
-        columns = (owned(mi.UInt32, x) for x in (i[of], j[of], number[part], LINES * blocks[of]))
-        values = _along_lines(facets, *columns, owned(mi.Float, unit[of]), stream)
+        first, second, block, count = (owned(mi.UInt32, x) for x in (i[of], j[of], number[part], LINES * blocks[of]))
+        values = _along_lines(facets, first, second, block, count, owned(mi.Float, unit[of]), stream)
         sums[:, part] = [np.array(dr.block_sum(x, LINES)) for x in values]
         progress(min(start + most, len(pair)), len(pair))
     halves = [np.where(number % 2 == half, sums, 0) for half in (0, 1)]
