@@ -9,7 +9,7 @@ from .extras import optional
 ROUNDS = 60  # of Newton's method
 CLOSE = 1e-13  # relative error of the sums that is as good as none
 ACCURACY = 1e-7, 1e-2  # of the linear systems, which goes with the error
-LEAST = 1e-10  # weight; what is certain gives way if nothing else can
+LEAST = 1e-10  # of the largest sum: smallest weight, so that sure entries give way if nothing else can
 
 
 def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarray, sums: np.ndarray) -> tuple:
@@ -18,15 +18,16 @@ def balance(matrix: Any, weight: np.ndarray, outside: np.ndarray, give: np.ndarr
     g(t) is 1 + t for t > 0 and exp(t) for t < 0: entries grow as in least squares, and shrink without changing sign.
     An exponential on both sides would let one entry of large variance explode where a sure row needs a large y.
 
-    matrix: X, symmetric and ≥ 0 (SciPy CSR [n, n]); weight: w of its entries, symmetric, their relative variances;
-    outside, give: O and v [k, n]; sums: s ≥ 0 [n]. X' is symmetric and ≥ 0, and keeps zeros; entries change in
-    proportion to their variance, which to first order is the least change in units of their errors. y minimises the
-    convex function whose gradient is the excess of the sums, by Newton's method. Returns the data of X', and O'. Rows that are empty, or whose
-    sum is 0, stay as they are; the best y met is used where none fits, as with two facets of different size that see
-    nothing but each other.
+    matrix: X, symmetric and ≥ 0 (SciPy CSR [n, n]); weight: w of its entries, symmetric: variance over value;
+    outside, give: O and v [k, n]; sums: s ≥ 0 [n]. X' is symmetric and ≥ 0, and keeps zeros. Entries change by their
+    variance times y_i + y_j, which to first order is the least change in units of their errors. y minimises the convex
+    function whose gradient is the excess of the sums, by Newton's method. Returns the data of X', and O'. Rows that are
+    empty, or whose sum is 0, stay as they are. The best y found is used where none fits, as with two facets of
+    different size that see nothing but each other.
     """
     linalg = optional("scipy.sparse.linalg", "the closing of view factors", "factors")
-    weight, give = np.maximum(weight, LEAST), np.maximum(give, LEAST)
+    least = LEAST * sums.max(initial=0)
+    weight, give = np.maximum(weight, least), np.maximum(give, least)
     ones, each = np.ones(len(sums)), np.diff(matrix.indptr)
     idle = (matrix @ ones + outside.sum(axis=0) <= 0) | (sums <= 0)
     target = np.where(idle, 1.0, sums)

@@ -17,9 +17,10 @@ def exchange_area(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """A_p F_pq of pairs of triangles in full view of each other, m² (float64 [pairs]).
 
     By Stokes' theorem, 1/2π ∮∮ ln r dx·dy over both borders: the inner integral in closed form, the outer one by
-    Gauss' rule, its nodes crowded towards the ends where ln r is singular if triangles touch. Where contours come close
-    to each other, sides are split at the places closest to a corner or to a side of the other contour, because ln r
-    varies there over a distance as small as the gap. What lies behind the plane of the other triangle is cut off. p, q: corners, counter-clockwise as seen from the side meant [pairs, 3, 3].
+    Gauss' rule, its nodes crowded towards the ends where ln r is singular if triangles touch. Where contours come
+    close, sides are split at the places closest to a corner or to a side of the other contour, because ln r varies
+    there over a distance as small as the gap. What lies behind the plane of the other triangle is cut off. p, q:
+    corners, counter-clockwise as seen from the side meant [pairs, 3, 3].
     Source: Sparrow, "A new and simpler formulation for radiative angle factors", 1963.
     """
     centre = [t.mean(axis=1) for t in (p, q)]
@@ -31,15 +32,15 @@ def exchange_area(p: np.ndarray, q: np.ndarray) -> np.ndarray:
         gap = np.array(_gap(_corners(p[part]), _corners(q[part])))
         close[part] = gap < CLOSE * np.minimum(radius[0][part], radius[1][part])
     result = np.zeros(len(p))
-    for group, nodes, pieces in (
-        (far, _gauss(NODES_FAR, 0), 1),
-        (~far & ~close, _gauss(NODES_NEAR, 1), 1),
-        (close, _gauss(NODES_NEAR, 1), 4),
+    for group, nodes, weights, pieces in (
+        (far, *_gauss(NODES_FAR, 0), 1),
+        (~far & ~close, *_gauss(NODES_NEAR, 1), 1),
+        (close, *_gauss(NODES_NEAR, 1), 4),
     ):
         chosen = np.flatnonzero(group)
         for start in range(0, len(chosen), AT_ONCE):
             part = chosen[start : start + AT_ONCE]
-            result[part] = np.array(_contours(_corners(p[part]), _corners(q[part]), *nodes, pieces))
+            result[part] = np.array(_contours(_corners(p[part]), _corners(q[part]), nodes, weights, pieces))
     return np.maximum(result, 0)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.arrays import NONE, lower_bound, opaque_index, owned
 from ..core.errors import RadiosityError
 from ..core.extras import optional
-from ..core.points import Stream, kronecker, stream_seed, triangle
+from ..core.points import Stream, paired_nets, stream_seed, triangle
 from ..mesh import Elements
 from ..mesh.exposure import is_covered
 from ..mesh.subdivision import NODES
@@ -119,7 +119,7 @@ def count_rays(
 ) -> Counts:
     """Cast ``rays`` cosine-distributed rays from every row, shared out to its cells by area and rounded up.
 
-    Low-discrepancy within every cell, in position and direction. Counts do not depend on threads or batches.
+    Low-discrepancy within every cell, in position and in direction. Counts do not depend on threads or batches.
     """
     sparse = optional("scipy.sparse", "a matrix of view factors", "factors")
     n, size = len(facets), np.bincount(facets.row, weights=facets.area)
@@ -156,13 +156,14 @@ def _added_up(keys, count=None):
 def _casts(facets, cast, seed, up, progress):
     """Cell · 2³² + the cell met, or cells + a number of OUTSIDE, or NONE for rays that go nowhere (uint64 [rays])."""
     ends, total = np.cumsum(cast), int(cast.sum())
-    last, first = owned(mi.UInt32, ends), owned(mi.UInt32, ends - cast)
+    last, first, count = (owned(mi.UInt32, x) for x in (ends, ends - cast, cast))
     keys, stream = facets.elements.key(facets.cells), opaque_index(stream_seed(seed, Stream.FACTORS))
     up = mi.Vector3f(*(dr.opaque(mi.Float, x) for x in up))
     done = 0
     for ray in launches(total, AT_ONCE):
         cell = lower_bound(last, ray + 1)
-        met = _ends(facets, cell, kronecker(ray - dr.gather(mi.UInt32, first, cell), keys, stream, cell), up)
+        start, of = (dr.gather(mi.UInt32, x, cell) for x in (first, count))
+        met = _ends(facets, cell, paired_nets(ray - start, of, keys, stream, cell), up)
         dr.eval(cell, met)
         yield (np.array(cell).astype(np.uint64) << np.uint64(32)) | np.array(met)
         done += dr.width(ray)

@@ -42,9 +42,11 @@ class ViewFactors:
     """View factors between the facets of a scene.
 
     F: [rows, columns], SciPy CSR; column j < rows is facet j, and any further ones are, in this order and where rays
-    end there: "sky", "ground", and "backs", sides that have no material. error: standard errors, in the same places;
-    where F has no entry it is below some 3 / rays. names: of the columns. areas: of the facets, without what lies under
-    others or inside solids, m² [rows]. closure: what was adjusted. stats: rays, lines, seconds.
+    end there: "sky", "ground", and "backs", sides that have no material. error: standard errors, in the same places: at
+    least 95 % of the entries lie within two of them. Where F has no entry, no ray connected the two facets: it is below
+    3 / rays in 95 % of such cases, rays being those of the row that start on its visible area. names: of the columns.
+    areas: visible areas of the facets, without what lies under others or inside solids, m² [rows]. closure: what was
+    adjusted. stats: rays, lines, seconds.
     """
 
     F: Any
@@ -101,9 +103,9 @@ def view_factors(
     facet, 1,024 by default, and 131,072 from shapes. up: what tells the sky from the ground. progress: called with
     (stage, done, total).
 
-    Where few rays connect two faces (or leaves) their number is the estimate; where many do, it is their exchange area
-    in full view, by contour integrals, times the share of as many lines between them that nothing blocks, weighted by
-    the kernel. Raises RadiosityError for options and scenes that cannot be used.
+    Where few rays connect two faces (or leaves), the share of rays that connect them is the estimate. Where many do,
+    the estimate is the exchange area in full view, by contour integrals, times the visible share of sample lines that
+    are distributed like the kernel. Raises RadiosityError for options and scenes that cannot be used.
     """
     start = time.perf_counter()
     rays = RAYS.get(level, 1) if rays is None else whole_number("rays", rays)
@@ -171,11 +173,11 @@ class _Exchange:
         self.area = like(self.area, area)
 
     def _refine(self, chosen, seed):
-        """Replace the ray estimates of pairs i < j by those of sample lines, where enough rays are to be expected.
+        """Replace the ray estimates of pairs i < j by those of sample lines, where enough rays are expected.
 
-        There are as many lines as rays would connect the cells in full view. The ratio Σ k V / Σ k is the visible share.
-        The weight of each half of the lines depends on the other half only: a weight that depended on the estimate
-        itself would shift its mean.
+        There are as many lines as rays would connect the cells in full view. Σ k V / Σ k is the visible share. The
+        weight of each half of the lines depends on the other half only: a weight that depended on the estimate itself
+        would shift its mean.
         """
         i, j = self._of[chosen], self.area.indices[chosen]
         whole, both = exchange_area(self.facets.corners[i], self.facets.corners[j]), self.density[i] + self.density[j]
@@ -222,16 +224,27 @@ def _closed(facets, counts, flow, start):
     """The matrix of the rows, closed."""
     n, row = len(facets.names), facets.row
     X, V, unit = flow.rows(n)
+    V = V + UNSEEN * unit**2
+    # Where rays end outside, and starts on covered area: what the rows sum to is known, how much is covered is not.
+    columns = np.column_stack([counts.outside, counts.cast - counts.kept])
+    there = np.flatnonzero(columns.any(axis=0))
+    binomial = columns * (1 - columns / np.maximum(counts.cast, 1)[:, None])
     ray = 1 / flow.density  # m² per ray
-    areas = np.bincount(row, weights=counts.kept * ray, minlength=n)
-    there = np.flatnonzero(counts.outside.any(axis=0))
+    unseen = np.zeros(n)
+    np.maximum.at(unseen, row, ray)
 
-    def outer(values, per_ray):
+    def by_rows(values, per_ray):
         return np.array([np.bincount(row, weights=values[:, k] * per_ray, minlength=n) for k in there]).reshape(-1, n)
 
-    O, P = outer(counts.outside, ray), outer(_binomial(counts), ray**2)  # exchange areas and their variances
-    closed, beyond = balance(X, _relative(V, X.data), O, _relative(P, O), areas)
-    over = np.where(areas > 0, 1 / np.where(areas > 0, areas, 1), 0)
+    O, P = by_rows(columns, ray), by_rows(binomial, ray**2) + UNSEEN * unseen**2  # exchange areas and their variances
+    whole = np.bincount(row, weights=facets.area, minlength=n)
+    closed, beyond = balance(X, _ratio(V, X.data), O, _ratio(P, O), whole)
+    outside = there < len(OUTSIDE)
+    covered = np.where(O[~outside] > 0, P[~outside], 0).sum(axis=0)  # variance of the areas
+    kept = np.bincount(row, weights=counts.kept, minlength=n) > 0
+    areas = np.where(kept, np.maximum(whole - beyond[~outside].sum(axis=0), 0), 0)
+    O, P, beyond = O[outside], P[outside], beyond[outside]
+    over = _ratio(np.ones(n), areas)
 
     def matrix(inner, outer):
         """Entries over the areas of the rows, with columns for the outside."""
@@ -239,18 +252,19 @@ def _closed(facets, counts, flow, start):
         return _with_columns(like(X, inner), outer * over)
 
     F = matrix(closed, beyond)
-    unseen = np.array([_largest(ray, row, n)] * len(there)).reshape(-1, n)
-    error = matrix(np.sqrt(V + UNSEEN * unit**2), np.sqrt(P + UNSEEN * unseen**2))
+    of_areas = np.repeat(covered * over**2, np.diff(X.indptr))
+    error = matrix(np.sqrt(V + of_areas * closed**2), np.sqrt(P + covered * over**2 * beyond**2))
+    raw = _ratio(X.sum(axis=1) + O.sum(axis=0), areas)
     closed -= X.data
     closed *= np.repeat(over, np.diff(X.indptr))
     change = [np.abs(closed), np.abs((beyond - O) * over).ravel()]
     return ViewFactors(
         F=F,
         error=error,
-        names=(*facets.names, *(OUTSIDE[k] for k in there)),
+        names=(*facets.names, *(OUTSIDE[k] for k in there[outside])),
         areas=areas,
         closure=Closure(
-            raw_row_error=float(np.abs((X.sum(axis=1) + O.sum(axis=0)) * over - 1)[areas > 0].max(initial=0)),
+            raw_row_error=float(np.abs(raw - 1)[areas > 0].max(initial=0)),
             row_error=float(np.abs(F.sum(axis=1) - 1)[areas > 0].max(initial=0)),
             largest=float(max(x.max(initial=0) for x in change)),
             mean=float(sum(x.sum() for x in change) / max(F.nnz, 1)),
@@ -271,22 +285,6 @@ def _with_columns(matrix, columns):
     data[own], indices[own] = matrix.data, matrix.indices
     data[added], indices[added] = columns, m + np.arange(k)[:, None]
     return type(matrix)((data, indices, matrix.indptr + k * np.arange(n + 1)), shape=(n, m + k))
-
-
-def _binomial(counts):
-    """Variances of how many rays go where outside [cells, OUTSIDE]."""
-    return counts.outside * (1 - counts.outside / np.maximum(counts.kept, 1)[:, None])
-
-
-def _largest(values, row, n):
-    """The largest value of every row, 0 for rows without any (float64 [n])."""
-    largest = np.zeros(n)
-    np.maximum.at(largest, row, values)
-    return largest
-
-
-def _relative(variance, value):
-    return _ratio(variance, value**2)
 
 
 def _ratio(a, b):

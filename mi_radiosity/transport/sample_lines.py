@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import opaque_index, owned, runs
-from ..core.points import Stream, hash_pair, kronecker, stream_seed, triangle
+from ..core.points import Stream, hash_pair, paired_nets, stream_seed, triangle
 from ..mesh.subdivision import NODES
 from .facets import AT_ONCE, Facets
 
@@ -26,7 +26,7 @@ def visible_sums(
     """Σ k, Σ k², Σ k V and Σ k² V over the sample lines of pairs of cells, by halves (float64 [4, 2, pairs]).
 
     i, j: cells [pairs]; whole: their exchange areas in full view, m² [pairs]; blocks: of LINES lines each, an even
-    number [pairs]. k is the kernel over the density of the line, in units of its mean; V is 1 for visible lines, else 0.
+    number [pairs]. k is the kernel over the density of the line, in units of its mean. V is 1 for visible lines.
 
     One end of a line is uniform on the smaller cell, the other end is uniform in the solid angle of the larger cell.
     So k = A Ω cos θ / (π · whole) is bounded, also where cells touch and the kernel itself is singular.
@@ -39,22 +39,24 @@ def visible_sums(
     sums, most = np.zeros((4, len(pair))), AT_ONCE // LINES
     for start in range(0, len(pair), most):
         part = slice(start, start + most)
-        columns = (owned(mi.UInt32, x) for x in (i[pair[part]], j[pair[part]], number[part]))
-        values = _along_lines(facets, *columns, owned(mi.Float, unit[pair[part]]), stream)
+        of = pair[part]
+        first, second, block, count = (owned(mi.UInt32, x) for x in (i[of], j[of], number[part], LINES * blocks[of]))
+        values = _along_lines(facets, first, second, block, count, owned(mi.Float, unit[of]), stream)
         sums[:, part] = [np.array(dr.block_sum(x, LINES)) for x in values]
         progress(min(start + most, len(pair)), len(pair))
     halves = [np.where(number % 2 == half, sums, 0) for half in (0, 1)]
     return np.stack([np.add.reduceat(half, np.cumsum(blocks) - blocks, axis=1) for half in halves], axis=1)
 
 
-def _along_lines(facets, i, j, number, unit, stream):
+def _along_lines(facets, i, j, number, count, unit, stream):
     """k, k², k V and k² V along the lines of blocks (four Float [LINES · blocks])."""
     e, p, rays = facets.elements, facets.model.patches, facets.model.rays
     i, j = (dr.gather(mi.UInt32, facets.cells, cell) for cell in (i, j))
     line = dr.arange(mi.UInt32, LINES * dr.width(i))
     block = line // LINES
     index = LINES * dr.gather(mi.UInt32, number, block) + line % LINES
-    x0, x1, y0, y1 = kronecker(index, hash_pair(e.key(i), e.key(j)), stream, block)
+    count = dr.gather(mi.UInt32, count, block)
+    x0, x1, y0, y1 = paired_nets(index, count, hash_pair(e.key(i), e.key(j)), stream, block)
     i, j = dr.gather(mi.UInt32, i, block), dr.gather(mi.UInt32, j, block)
     patch_i, patch_j = dr.gather(mi.UInt32, e.patch, i), dr.gather(mi.UInt32, e.patch, j)
     n_i, n_j = (dr.gather(mi.Vector3f, p.normal, patch) for patch in (patch_i, patch_j))
