@@ -100,10 +100,14 @@ class Lobes:
         if highlights is not None:
             glow += before * highlights.light(gloss, parts[0], bsdf, si, chance, alive & (parts[0] > 0))
         # Light that a side reflects or transmits diffusely counts as received by that side, which sends it on.
-        albedo = dr.gather(mi.Color3f, rays.patches.albedo, trail.patch, coated)
+        albedo = dr.gather(mi.Color3f, rays.albedo, trail.patch, coated)
         factor = dr.select(coated, dr.select(albedo > 0, value / albedo, 0), dr.select(on, value, 1))
-        # Sides with a diffuse lobe count all that meets them as received, the others nothing.
-        taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
+        if rays.patches.transmittance is None:
+            # Sides with a diffuse lobe count all that meets them as received, the others nothing.
+            taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
+        else:
+            # The same on average, but exact for each ray: albedo varies with direction, and so does what is received.
+            taken = dr.select(alive, before * (1 - factor), 0)
 
         depth += 1
         lives = dr.select(on & (depth > ROULETTE), dr.minimum(dr.max(before * factor), 0.95), 1)

@@ -21,7 +21,7 @@ class Rays:
     """Visibility in a scene, in the words of its patches."""
 
     def __init__(self, faces: Faces, patches: Patches, materials: Materials, overlaps: "Lookup | None" = None) -> None:
-        self.scene, self.patches = faces.tracing, patches
+        self.scene, self.patches, self.albedo = faces.tracing, patches, patches.albedo
         self._materials = materials
         self.lobes, self.glossy = Lobes() if materials.traced.any() else None, materials.glossy
         self._first_face = faces.first_face
@@ -34,7 +34,7 @@ class Rays:
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
         p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
-        named = [self._first_face, self.front, self._patch_of, self._materials.traced_faces, p.emission, p.albedo]
+        named = [self._first_face, self.front, self._patch_of, self._materials.traced_faces, p.emission, self.albedo]
         # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
         return [self.scene, self.scene.shapes_dr(), self._materials.bsdfs, *named, *overlaps]
 
