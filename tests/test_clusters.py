@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import mi_radiosity as mr
 from mi_radiosity.core.points import kronecker
 from mi_radiosity.evaluation import ladder
+from mi_radiosity.export import lit_mesh
 from mi_radiosity.mesh import Clusters, Pairs, Tree, cluster_labels
 from mi_radiosity.scene import Model
 from mi_radiosity.solver.cost import plan
@@ -213,6 +214,16 @@ def test_kept_with_their_clusters(model, tmp_path):
     patch = dr.arange(mi.UInt32, model.patches.count)
     np.testing.assert_array_equal(np.array(one.top(patch)), np.array(two.top(patch)))
     np.testing.assert_array_equal(np.array(solution.irradiance()), np.array(loaded.irradiance()))
+
+
+def test_exported_with_their_clusters(model):
+    """The lit mesh has the area of all leaves, and the light of the Gouraud field at its vertices."""
+    solution = mr.solve(model, elements=4_000, rays=50_000)
+    assert solution.elements.crown is not None
+    mesh = lit_mesh(solution)
+    lit = mesh.leaf >= 0
+    assert mesh.areas()[lit].sum() == pytest.approx(solution.leaves().area.sum(dtype=np.float64), rel=1e-4)
+    assert np.isfinite(mesh.radiosity).all() and mesh.irradiance.max() > 0
 
 
 @pytest.mark.parametrize(

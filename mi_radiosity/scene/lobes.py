@@ -77,10 +77,10 @@ class Lobes:
         # A diffuse lobe of a patch ends the ray: what it reflects or transmits, this side has received.
         ends = alive & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Diffuse) & on_patch & (dr.max(value) > 0)
         on = alive & ~ends
-        albedo = dr.gather(mi.Color3f, rays.patches.albedo, end.patch, ends)
+        albedo = dr.gather(mi.Color3f, rays.albedo, end.patch, ends)
         factor = dr.select(ends, dr.select(albedo > 0, value / albedo, 0), dr.select(on, value, 1))
-        # Sides with a diffuse lobe count all that arrives as received, the others nothing.
-        taken = dr.select(on, before * (dr.select(on_patch, 0, 1) - value), 0)
+        # Exact for each ray: the albedo varies with direction, and so does what counts as received.
+        taken = dr.select(alive, before * (1 - factor), 0)
 
         # Any other lobe sends it on, as far as Russian roulette allows.
         depth += 1

@@ -34,7 +34,7 @@ class Rays:
         overlaps: "Lookup | None" = None,
         in_room: np.ndarray | None = None,
     ) -> None:
-        self.scene, self.patches = faces.tracing, patches
+        self.scene, self.patches, self.albedo = faces.tracing, patches, patches.albedo
         self._materials = materials
         self.lobes = None if materials.all_plain else Lobes()
         self._first_face = faces.first_face
@@ -53,7 +53,7 @@ class Rays:
     def arrays(self) -> list[Any]:
         """What rays are traced and named with."""
         p, overlaps = self.patches, self.overlaps.arrays() if self.overlaps else []
-        named = [self._first_face, self.front, self._patch_of, *self._materials.arrays(), p.emission, p.albedo]
+        named = [self._first_face, self.front, self._patch_of, *self._materials.arrays(), p.emission, self.albedo]
         # Pointers tell Dr.Jit to look at all shapes and BSDFs there are, those of no scene as well.
         return [self.scene, self.scene.shapes_dr(), *named, *overlaps]
 
