@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -49,7 +50,8 @@ class Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit status: 0, 2 for what the user can mend, 130 after Ctrl-C."""
+    """Run one command; returns the exit status: 0, 2 for what the user can mend, 130 after Ctrl-C, 141 if the
+    reader of standard output has ended."""
     try:
         arguments = _parser().parse_args(argv)
         with interruptible(), printed_warnings():
@@ -59,6 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except RadiosityError as error:
         print(f"{PROGRAM}: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of standard output, such as `head`, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that Python's own flush does not fail, too
+        return 141
     except KeyboardInterrupt:
         print(f"{PROGRAM}: interrupted; finished files are whole, unfinished ones were not written", file=sys.stderr)
         return 130
