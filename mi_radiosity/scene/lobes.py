@@ -22,7 +22,8 @@ class Lobes:
 
     At every such surface one lobe is sampled by Mitsuba's `bsdf.sample`, for the transport of importance. A diffuse
     lobe ends the ray, whether it reflects or transmits. Its weight over the mean albedo ρ + τ of the patch multiplies
-    the power that arrives, so that the mean of what the patch receives is what arrives there. Any other lobe sends the ray on.
+    the power that arrives, so that the mean of what the patch receives is what arrives there. Any other lobe sends the
+    ray on.
     """
 
     def __init__(self) -> None:

@@ -272,6 +272,20 @@ def inspect_part(part: Part) -> Iterator[str]:
         yield "participating media are not modelled: remove the medium"
     if shape.is_emitter() and shape.emitter().get_medium() is not None:
         yield "its emitter is in a medium, and those are not modelled: remove the medium"
+    if kind := _unreadable(shape.bsdf()):
+        yield f"Mitsuba cannot list the parameters of its BSDF '{kind}', so it is not modelled: use another one"
+
+
+def _unreadable(bsdf):
+    """The class of the first of the nested BSDFs with a parameter that is None, such as Hair, or None."""
+    for part in children(bsdf):
+        if isinstance(part, mi.BSDF) and (kind := _unreadable(part)):
+            return kind
+    try:
+        dict(mi.traverse(bsdf))
+    except TypeError:
+        return bsdf.class_name()
+    return None
 
 
 def inspect_emitter(emitter: "mi.Emitter") -> Iterator[str]:
