@@ -261,6 +261,7 @@ def _info(arguments: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from .display import hides_emitters, unmodelled
     from .scene.report import report
     from .solver.cost import estimate_cost
 
@@ -276,6 +277,10 @@ def _info(arguments: argparse.Namespace) -> None:
         power = "?" if lamp.power is None else ", ".join(f"{p:.4g}" for p in lamp.power)
         lamps.add_row(lamp.name, lamp.kind, power, lamp.treatment)
     facts = Table(show_header=False)
+    if hides_emitters(scene):
+        facts.add_row("pictures", "show no emitters: the scene's integrator hides them")
+    for line in unmodelled(scene):
+        facts.add_row("warning", line)
     for name, value in [*_facts(scene, found), *_costs(estimate_cost(found.model) if found.model else None)]:
         facts.add_row(name, value)
     for table in (shapes, lamps, facts):

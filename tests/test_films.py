@@ -162,7 +162,9 @@ def test_commands_follow_the_scene(name, tmp_path, capsys):
         shown[word] = np.array(bitmap).mean(axis=(0, 1))
     np.testing.assert_allclose(shown[""], true, rtol=0.03)
     assert (shown["--no-hide-emitters"] < 0.95 * true).all()  # the back of the lamp covers some of the plate
+    assert main(["info", str(file)]) == 0 and "show no emitters" in capsys.readouterr().out
     assert main(["reference", str(file), "-o", str(tmp_path / "ref.exr"), "--spp", "256"]) == 0
+    assert "adds channels" in capsys.readouterr().err
     np.testing.assert_allclose(Reference.load(tmp_path / "ref.exr").image().mean(axis=(0, 1)), true, rtol=0.03)
     gallery = ["gallery", str(file), "-o", str(tmp_path / "g"), "--work", str(tmp_path / "w"), "--seconds", "0.3"]
     assert main([*gallery, "--reference-spp", "128"]) == 0

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.numbers import whole_number
 from ..core.points import Stream, stream_seed
 from ..display import SHADERS, CleanPicture, hides_emitters, linear_rgb
 from ..display.pixels import AT_ONCE
@@ -82,6 +83,9 @@ def run_bench(
     ``elements`` and ``rays`` are the middle of that ladder, and of one solve whose speed is told.
     """
     require_extra()
+    elements, rays, view = whole_number("elements", elements), whole_number("rays", rays), whole_number("view", view, 0)
+    reference_spp, views = whole_number("reference_spp", reference_spp), whole_number("views", views)
+    path_spp, runs = [whole_number("path_spp", spp) for spp in path_spp], whole_number("runs", runs)
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
     file.prepare()
     SHADERS.find(shading)

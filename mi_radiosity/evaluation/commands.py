@@ -17,6 +17,7 @@ from ..core.console import (
     progress_bars,
     shading_argument,
     view_name,
+    warn,
 )
 from ..core.errors import RadiosityError
 from ..core.files import check_writable
@@ -83,6 +84,7 @@ def _bench_arguments(parser):
 
 
 def _reference(arguments: argparse.Namespace) -> None:
+    from ..display import unmodelled
     from .reference import render_reference
 
     if arguments.output.suffix.lower() != ".exr":
@@ -90,6 +92,7 @@ def _reference(arguments: argparse.Namespace) -> None:
     check_writable(arguments.output)
     scene = arguments.file.load()
     views = choose_views(scene, arguments.view)
+    warn(unmodelled(scene))
     with progress_bars() as report:
         for view in views:
             path, stage = view_name(arguments.output, view, views), f"path tracing view {view}"
@@ -144,9 +147,12 @@ def _gallery(arguments: argparse.Namespace) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> None:
+    from ..display import unmodelled
     from .compare import PAPER, compare_oracles
 
-    views = choose_views(arguments.file.load(), arguments.view)
+    scene = arguments.file.load()
+    views = choose_views(scene, arguments.view)
+    warn(unmodelled(scene))
     with progress_bars() as report:
         compare_oracles(
             **_study(arguments, report),
@@ -162,12 +168,15 @@ def _compare(arguments: argparse.Namespace) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
+    from ..display import unmodelled
     from .bench import PATH_SPP, run_bench
     from .plots import panel_titles
 
     if arguments.view == "all":
         raise RadiosityError("--view all: bench looks from one sensor, name its number")
-    (view,) = choose_views(arguments.file.load(), arguments.view)
+    scene = arguments.file.load()
+    (view,) = choose_views(scene, arguments.view)
+    warn(unmodelled(scene))
     with progress_bars() as report:
         results = run_bench(
             **_study(arguments, report),

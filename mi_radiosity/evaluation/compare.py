@@ -8,6 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..core.errors import RadiosityError
+from ..core.numbers import whole_number
 from ..display import SHADERS, write_image
 from ..oracles import parse
 from ..scene import Model
@@ -47,6 +48,11 @@ def compare_oracles(
     Raises RadiosityError for what the user can mend.
     """
     require_extra()
+    elements, rays, lines = (
+        whole_number(name, n) for name, n in (("elements", elements), ("rays", rays), ("lines", lines))
+    )
+    spp, seeds = whole_number("spp", spp), whole_number("seeds", seeds)
+    reference_spp, views = whole_number("reference_spp", reference_spp), [whole_number("view", v, 0) for v in views]
     output, file = Path(output), scene_file(path, variant, definitions, plugins)
     file.prepare()
     questions, labels = _known_questions(questions), _known_oracles(oracles)

@@ -8,8 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.color import srgb
-from ..core.errors import RadiosityError
+from ..core.errors import RadiosityError, warn_of
 from ..core.files import writing
+from ..core.numbers import real_number, whole_number
+from ..display import unmodelled
 from ..scene import Model
 from .bench import now, pictures_within
 from .metrics import compare
@@ -45,7 +47,8 @@ def write_gallery(
 
     files: scenes, of which the first sensor is looked from. work: where references are kept, and resumed.
     """
-    files = list(files)
+    files, seconds = list(files), real_number("seconds", seconds, 0)
+    reference_spp = whole_number("reference_spp", reference_spp)
     folder = output / "gallery"
     for path in (folder, work):
         make_folder(path)
@@ -83,6 +86,8 @@ def _row(file, work, seconds, spp, denoise, progress):
     scene = file.load()
     if not scene.sensors():
         raise RadiosityError(f"{file.path} has no sensor: add one to the file")
+    for line in unmodelled(scene):
+        warn_of(f"{file.path}: {line}")
     reference, _ = cached_reference(Model(scene), 0, work, spp, progress)
     halves = reference.halves()
 
