@@ -134,7 +134,9 @@ def test_thin_gaps(gap):
     shifted = (corner(0.5, 0.5) - 2 * corner(0.5, 1.5) + corner(1.5, 1.5)) / 4  # configuration algebra
     assert squares(SQUARE, SQUARE[::-1] + [0.5, 0.5, gap]) == pytest.approx(shifted, abs=1e-7)
     low = (corner(1, 1) + corner(1, 0.3) - corner(1, 0.7)) / 2  # the lowest 0.3 of a square before all of it
-    assert squares(SQUARE * [1, 0.3, 1], SQUARE[::-1] + [0, 0, gap]) == pytest.approx(low, abs=1e-7)
+    strip, square = SQUARE * [1, 0.3, 1], SQUARE[::-1] + [0, 0, gap]
+    assert squares(strip, square) == pytest.approx(low, abs=1e-7)
+    assert squares(square, strip) == pytest.approx(low, abs=1e-7)  # sides of the square pass the ends of the strip
 
 
 # ---- Sample lines ------------------------------------------------------------------------------------
