@@ -97,7 +97,6 @@ def test_definitions(capsys, monkeypatch, tmp_path):
         (["render", BOX, "-o", "x.png", "--alpha", "0"], "greater than 0"),
         (["render", BOX, "-o", "x.png", "--alpha", "nan"], "greater than 0"),
         (["render", BOX, "-o", "x.png", "--elements", "0"], "greater than 0"),
-        (["render", BOX, "-o", "x.png", "--elements", "3"], "ask for 9 or more"),
         (["render", BOX, "-o", "x.png", "--rays", "many"], "not a whole number"),
         (["render", BOX, "-o", "x.png", "--oracle", "gmi:x"], "must be a number"),
         (["render", BOX, "-o", "x.png", "--oracle", "ks:2"], "no parameter"),

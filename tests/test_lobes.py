@@ -272,7 +272,7 @@ def test_light_of_points_through_glass_is_kept_and_named(tmp_path):
 def test_a_scene_without_a_diffuse_lobe_is_refused_in_one_line():
     for bsdf in ("dielectric", "conductor"):
         glass = {"type": "scene", "it": {"type": "sphere", "bsdf": {"type": bsdf}}, "lamp": POINT_LAMP}
-        with pytest.raises(mr.RadiosityError, match="no surface with a diffuse lobe"):
+        with pytest.raises(mr.RadiosityError, match="no surface has a diffuse lobe"):
             mr.solve(mi.load_dict(glass))
 
 
