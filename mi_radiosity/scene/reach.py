@@ -65,14 +65,18 @@ def _cast(rays, patch, number):
     origin, direction = rays.leave(patch, *triangle(u, v), s, t)
     links, escaped = [], []
     for depth in range(MAX_SURFACES + 1):
+        if dr.width(patch) == 0:
+            break
         side, _, _ = rays.side_met(origin, direction)
         hit = rays.patch_of(side, side != NONE)
         dr.eval(side, hit, origin, direction)
         linked = np.array(hit) != NONE
         links.append((np.array(patch)[linked], np.array(hit)[linked]))
         escaped.append(np.array(patch)[np.array(side) == NONE])
-        on = dr.compress(goes_on(rays, side)) if rays.lobes else mi.UInt32()
-        if depth == MAX_SURFACES or dr.width(on) == 0:
+        if rays.lobes is None:
+            break
+        on = dr.compress(goes_on(rays, side))
+        if dr.width(on) == 0:
             break
         origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
         patch, hit, number = (dr.gather(mi.UInt32, x, on) for x in (patch, hit, number))
