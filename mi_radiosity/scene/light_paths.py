@@ -87,7 +87,9 @@ def _from_free(lights):
     for k, light in enumerate(lights.free):
         number, seed = dr.arange(mi.UInt32, max(1, PATHS // len(lights.free))), opaque_index(k)
         origin, direction, _ = light.shoot(*kronecker(number, seed, seed))
-        paths.append(_Paths(origin, direction, hash_pair(number, ~seed)))
+        every = dr.zeros(mi.Vector3f, dr.width(number))  # a directional emitter has one direction for all rays
+        key = hash_pair(number, ~seed)
+        paths.append(_Paths(mi.Point3f(origin + every), mi.Vector3f(direction + every), key))
     return paths
 
 

@@ -58,26 +58,31 @@ def _cast(rays, patch, number):
     """Links between patches that one cosine-distributed ray per entry finds (list of pairs of int arrays), and the
     patches from which rays leave the scene (int).
 
-    A ray ends at the first surface with nothing but diffuse reflection; it links all patches it hits. It goes on
-    through up to MAX_SURFACES others, by one sampled lobe each, so there are at most MAX_SURFACES + 1 segments per ray.
+    A ray ends at the first surface with nothing but diffuse reflection. It goes on through up to MAX_SURFACES others,
+    by one sampled lobe each, but through one patch only, because that patch and the next one cast rays of their own.
+    So there are at most MAX_SURFACES + 1 segments per ray.
     """
     seed = opaque_index(stream_seed(0, Stream.REACH))
     patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
     u, v, s, t = kronecker(number, patch, seed)
     origin, direction = rays.leave(patch, *triangle(u, v), s, t)
-    links, escaped = [], []
+    links, escaped, start = [], [], patch
     for depth in range(MAX_SURFACES + 1):
+        if dr.width(patch) == 0:
+            break
         side, _, _ = rays.side_met(origin, direction)
         hit = rays.patch_of(side, side != NONE)
         dr.eval(side, hit, origin, direction)
         linked = np.array(hit) != NONE
         links.append((np.array(patch)[linked], np.array(hit)[linked]))
         escaped.append(np.array(patch)[np.array(side) == NONE])
-        on = dr.compress(goes_on(rays, side)) if rays.lobes else mi.UInt32()
-        if depth == MAX_SURFACES or dr.width(on) == 0:
+        if rays.lobes is None:
+            break
+        on = dr.compress(goes_on(rays, side) & ((hit == NONE) | (patch == start)))
+        if dr.width(on) == 0:
             break
         origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
-        patch, hit, number = (dr.gather(mi.UInt32, x, on) for x in (patch, hit, number))
+        start, patch, hit, number = (dr.gather(mi.UInt32, x, on) for x in (start, patch, hit, number))
         w, x, s, t = kronecker(opaque_index(depth), hash_pair(patch, number), seed)
         patch = dr.select(hit != NONE, hit, patch)
         origin, direction, carries = pass_on(rays, origin, direction, w, x, s, t)
@@ -85,7 +90,7 @@ def _cast(rays, patch, number):
         if dr.width(on) == 0:
             break
         origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
-        patch, number = (dr.gather(mi.UInt32, x, on) for x in (patch, number))
+        start, patch, number = (dr.gather(mi.UInt32, x, on) for x in (start, patch, number))
     return links, np.concatenate(escaped)
 
 
