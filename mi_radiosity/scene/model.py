@@ -54,8 +54,9 @@ class Model:
         paths = light_paths(rays, self.lights) if lit and self.lights.any_power else None
         if lit and not paths:
             self.faces.warnings.append("no emitter has any power: the solution is black")
-        elif sides is None and paths:
-            found = reached(rays, self.lights, paths)
+        rooms = seen_by_light(self.faces, paths.hits) if paths else np.zeros(0, dtype=bool)
+        if sides is None and paths:
+            found = reached(self._rays(patches, overlaps, rooms) if rooms.any() else rays, self.lights, paths)
             if not found.any():
                 self.faces.warnings.append("no light reaches any surface with a diffuse lobe: the solution is black")
                 found[:] = True
@@ -65,7 +66,8 @@ class Model:
         self.patches = patches
         kept, doubled = overlaps.among(self._numbers(patches.sides))
         self.rays = self._rays(patches, kept)
-        rooms = seen_by_light(self.faces, paths.hits) if paths else seen_from_patches(self.faces, self.rays)
+        if not paths:
+            rooms = seen_from_patches(self.faces, self.rays)
         if rooms.any():
             self.rays = self._rays(patches, kept, rooms)
         self.warnings = self.faces.warnings + self._warn_of(doubled)

@@ -143,6 +143,12 @@ class Rays:
         """Do sides belong to surfaces that let light through: with a lobe that transmits (Bool [n])?"""
         return active & self._materials.is_transmitting(side >> 1, active)
 
+    def is_wall_of_room(self, side: "mi.UInt32") -> "mi.Bool":
+        """Are sides, NONE allowed, walls of rooms that have no patch (Bool [n])?"""
+        if not self.has_rooms_behind_backs:
+            return dr.full(mi.Bool, False, dr.width(side))
+        return dr.gather(mi.UInt32, self._kind, side, side != NONE) == ROOM
+
     @property
     def side_count(self) -> int:
         """Number of sides: two of every face."""

@@ -24,7 +24,8 @@ def reached(rays: Rays, lights: Lights, paths: LightPaths) -> np.ndarray:
     through surfaces that pass light on (see `_cast`). Light spreads along the rays, in both directions, until nothing
     new is reached. What is still dark casts PROBES rays. Rays hardly find emitters that are small or seen at a grazing
     angle, and light paths hardly find small patches, so every patch traces as many shadow rays to emitters as well.
-    A ray that leaves the scene sees the sky, if there is one.
+    A ray that leaves the scene sees the sky, if there is one. A ray that hits a side without a patch that light paths
+    have hit (see `scene.solids`) starts in a room with light, even if the walls of that room reflect none.
     """
     patches = rays.patches
     emits = np.array(dr.max(patches.emission) > 0).astype(bool)
@@ -36,8 +37,9 @@ def reached(rays: Rays, lights: Lights, paths: LightPaths) -> np.ndarray:
     glances = PROBES if patches.count <= FEW else GLANCES
     for first, last in ((0, glances), (glances, probes)):
         source, number = np.repeat(dark, last - first), np.tile(np.arange(first, last), len(dark))
-        joined, escaped = _cast(rays, source, number)
+        joined, escaped, in_room = _cast(rays, source, number)
         links += joined
+        lit[in_room] = True
         if emits.any():
             links.append(_towards_lamps(rays, np.flatnonzero(emits), source, number))
         if lights.sky_light:
@@ -55,8 +57,8 @@ def reached(rays: Rays, lights: Lights, paths: LightPaths) -> np.ndarray:
 
 
 def _cast(rays, patch, number):
-    """Links between patches that one cosine-distributed ray per entry finds (list of pairs of int arrays), and the
-    patches from which rays leave the scene (int).
+    """Links between patches that one cosine-distributed ray per entry finds (list of pairs of int arrays), the patches
+    from which rays leave the scene, and those from which they hit the walls of rooms (int).
 
     A ray ends at the first surface with nothing but diffuse reflection. It goes on through up to MAX_SURFACES others,
     by one sampled lobe each, but through one patch only, because that patch and the next one cast rays of their own.
@@ -66,7 +68,7 @@ def _cast(rays, patch, number):
     patch, number = owned(mi.UInt32, patch), owned(mi.UInt32, number)
     u, v, s, t = kronecker(number, patch, seed)
     origin, direction = rays.leave(patch, *triangle(u, v), s, t)
-    links, escaped, start = [], [], patch
+    links, escaped, in_room, start = [], [], [], patch
     for depth in range(MAX_SURFACES + 1):
         if dr.width(patch) == 0:
             break
@@ -76,6 +78,7 @@ def _cast(rays, patch, number):
         linked = np.array(hit) != NONE
         links.append((np.array(patch)[linked], np.array(hit)[linked]))
         escaped.append(np.array(patch)[np.array(side) == NONE])
+        in_room.append(np.array(patch)[np.array(rays.is_wall_of_room(side)).astype(bool)])
         if rays.lobes is None:
             break
         on = dr.compress(goes_on(rays, side) & ((hit == NONE) | (patch == start)))
@@ -87,11 +90,9 @@ def _cast(rays, patch, number):
         patch = dr.select(hit != NONE, hit, patch)
         origin, direction, carries = pass_on(rays, origin, direction, w, x, s, t)
         on = dr.compress(carries)
-        if dr.width(on) == 0:
-            break
         origin, direction = dr.gather(mi.Point3f, origin, on), dr.gather(mi.Vector3f, direction, on)
         start, patch, number = (dr.gather(mi.UInt32, x, on) for x in (start, patch, number))
-    return links, np.concatenate(escaped)
+    return links, np.concatenate(escaped), np.concatenate(in_room)
 
 
 def _towards_lamps(rays, lamps, patch, number):
