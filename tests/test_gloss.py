@@ -1,4 +1,4 @@
-"""Pictures of rough metal: lamps in it, and how well spread its lobes are."""
+"""Pictures of rough metal and principled materials: emitters in them, noise, and how well spread directions are."""
 
 import mi_radiosity as mr
 from mi_radiosity.transport import Paths
@@ -13,14 +13,23 @@ T = mi.ScalarTransform4f
 PATH = {"type": "path", "max_depth": -1}
 
 
-def plate(lamp):
+ROUGH = {"type": "roughconductor", "alpha": 0.2}
+WOOD = {"type": "rgb", "value": [0.5, 0.3, 0.2]}
+BSDFS = {
+    "rough metal": ROUGH,
+    **{f"principled {r}": {"type": "principled", "base_color": WOOD, "roughness": r} for r in (0.3, 0.5)},
+    "principled metal": {"type": "principled", "base_color": WOOD, "roughness": 0.5, "metallic": 1.0},
+}
+
+
+def plate(lamp, bsdf=ROUGH):
     film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
     look = T().look_at([-1.5, 0, 1.0], [0, 0, 0], [0, 0, 1])
     return mi.load_dict(
         {
             "type": "scene",
             "camera": {"type": "perspective", "fov": 60, "to_world": look, "film": film},
-            "plate": rectangle(bsdf={"type": "roughconductor", "alpha": 0.2}),
+            "plate": rectangle(bsdf=bsdf),
             "wall": rectangle(T().translate([1, 0, 1]).rotate([0, 1, 0], -90), bsdf=diffuse(0.5)),
             "lamp": lamp,
         }
@@ -58,10 +67,11 @@ def variance(images):
     return each[: int(0.99 * len(each))].mean()
 
 
+@pytest.mark.parametrize("bsdf", BSDFS)
 @pytest.mark.parametrize("name", LAMPS)
-def test_pictures_have_no_more_noise_than_path(name):
+def test_pictures_have_no_more_noise_than_path(name, bsdf):
     """At as many samples, between ten seeds."""
-    truth = plate(LAMPS[name])
+    truth = plate(LAMPS[name], BSDFS[bsdf])
     solution = mr.solve(truth, mr.Uniform(), elements=500, rays=100_000)
     path = mi.load_dict(PATH)
     ours = np.array([solution.render(spp=16, shading="gather", seed=seed)[..., :3] for seed in range(10)])
