@@ -77,6 +77,10 @@ def test_every_line_counts():
             cast.append(dr.width(a))
             return self._rays.blocked(a, *rest)
 
+        def blocked_along(self, start, *rest):
+            cast.append(dr.width(start))
+            return self._rays.blocked_along(start, *rest)
+
         def kernel_at(self, x, *rest):
             cast.append(dr.width(x))
             return self._rays.kernel_at(x, *rest)

@@ -8,8 +8,7 @@ from mi_radiosity.display import denoise, pixels
 from mi_radiosity.display.image import write_image
 from mi_radiosity.scene import Model
 from mi_radiosity.solver import cost
-from mi_radiosity.transport import Gatherer
-from mi_radiosity.transport.gather import Found
+from mi_radiosity.transport import Gatherer, PathEnd
 
 import drjit as dr
 import mitsuba as mi
@@ -305,9 +304,9 @@ def test_looking_up_light_beside_walls_loses_none():
     patch = dr.gather(mi.UInt32, e.patch, leaf)
     u, v = e.patch_point(leaf, mi.Float(a.astype(np.float32)), mi.Float(b.astype(np.float32)))
 
-    dark = mi.Color3f(0)
-    hit = Found(dark, dark, dark, leaf, patch, u, v, mi.Color3f(1))
-    found = np.array(gatherer.reflected_by(hit).x).reshape(n, m).mean(axis=1)
+    yes = mi.Bool(True)
+    end = PathEnd(mi.Color3f(0), mi.Color3f(1), leaf, patch, u, v, yes, yes)
+    found = np.array(gatherer.reflected_by(end).x).reshape(n, m).mean(axis=1)
     want = np.array(dr.gather(mi.Float, e.reflectance.x * solution.irradiance().x, crossed))
     want = want * np.array(exposure.open_share(e, crossed))
     area = np.array(dr.gather(mi.Float, e.area, crossed))

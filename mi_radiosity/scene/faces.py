@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import owned, row_keys, runs
 from ..core.errors import RadiosityError
+from .meshes import unit
 from .tessellate import tracing_scene
 
 RAY_OFFSET = 2.0**-18  # of the largest coordinate: some 30 roundings of float32
@@ -98,7 +99,7 @@ class Faces:
             faces = np.array(mesh.faces_buffer()).reshape(-1, 3)
             part, start = slice(start, start + len(faces)), start + len(faces)
             if mesh.has_vertex_normals() and not mesh.has_face_normals():
-                normals = np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3)[faces]
+                normals = unit(np.array(mesh.vertex_normals_buffer(), dtype=np.float64).reshape(-1, 3))[faces]
                 cosine[part] = np.abs(np.einsum("ijk,ik->ij", normals, self.normal[part])).min(axis=1)
         return ~self.degenerate & (cosine < BENT)
 

@@ -172,7 +172,7 @@ class Rays:
         surface: unit normals of the surfaces that rays leave. Then the far side of a gap counts as well that is
         narrower than GAP and has no patch, even if a room is behind it.
         """
-        prelim = self.meet(origin, direction, active)
+        prelim = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), active=active)
         side, _, _ = self._side_at(prelim, direction)
         valid = side != NONE
         kind = dr.gather(mi.UInt32, self._kind, side, valid)

@@ -25,7 +25,6 @@ MAX_DEPTH = 64  # vertices after which it ends
 WIDE = 10.0  # density of a sampled direction, 1/sr, below which the cache is read from then on
 RESIDUAL = 4.0  # times its throughput: the probability that a path goes on after it has read the cache
 CANDIDATES = 4  # points of emitters that a shadow ray is chosen from
-SHORTER = 1 - 1e-3  # of the way to an emitter that a shadow ray goes, about as Mitsuba's do
 
 Reflectance = Callable[..., "mi.Color3f"]
 
@@ -270,9 +269,8 @@ class Paths:
         """What becomes of light π L, over its density, from so far along a direction."""
         value, pdf = lobe.eval_pdf(si.to_local(direction), on)
         on = on & (dr.max(dr.abs(value)) > 0)
-        ray = si.spawn_ray(direction)
-        ray.maxt = dr.minimum(distance * SHORTER, dr.largest(mi.Float))
-        on &= ~self._model.rays.scene.ray_test(ray, active=on)
+        near, far = si.spawn_ray_to(si.p + direction * distance), si.spawn_ray(direction)
+        on &= ~self._model.rays.scene.ray_test(dr.select(dr.isfinite(distance), near, far), active=on)
         return dr.select(on, value * light * dr.select(density > 0, _heuristic(density, pdf), 1), 0)
 
     def _density(self, x, leaf, direction, hit, on_patch, escaped):
