@@ -15,6 +15,7 @@ from .rays import Rays
 PATHS = 1 << 16  # from all area emitters together, and from all others; every emitting patch has one at least
 SEGMENTS = 1 << 20  # of all paths together; every path has MIN_SEGMENTS at least
 MAX_SEGMENTS, MIN_SEGMENTS = 8, 2  # of a path
+GO_ON = 4  # one in so many paths has more than one segment: first segments find patches, later ones rooms
 INSET = 2.0**-6  # of the way to the middle of a patch, from where a neighbour hides no point that lies before it
 NUDGE = 2.0**-16  # by which the direction of a neighbouring ray differs
 
@@ -63,6 +64,8 @@ def light_paths(rays: Rays, lights: Lights) -> LightPaths:
             if dr.width(paths.key) == 0:
                 break
             paths = _segment(rays, paths, number, lit, hits, number + 1 == segments)
+            if number == 0:
+                paths = paths.only(GO_ON * dr.arange(mi.UInt32, dr.width(paths.key) // GO_ON))
     return LightPaths(np.array(lit) > 0, np.array(hits, dtype=np.int64))
 
 
