@@ -74,6 +74,8 @@ class Materials:
             [mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.DiffuseTransmission) for s in shapes], dtype=bool
         )
         self._find_albedos(textured)
+        nulls = np.array([mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in shapes])
+        self._find_opacities(np.flatnonzero((nulls & textured)[faces.shape]))
         albedo = self.rho + self.tau
         faces.refuse(~np.isfinite(albedo).all(axis=(0, 2)), "has a reflectance that is not a number: repair its BSDF")
         # Some of Mitsuba's own models send out a few per cent too much, such as a white `principledthin`.
@@ -131,6 +133,33 @@ class Materials:
     def is_transmitting(self, face: "mi.UInt32", active: "mi.Bool | bool" = True) -> "mi.Bool":
         """Do faces have lobes that transmit light (Bool [n])?"""
         return dr.gather(mi.UInt32, self._transmitting_faces, face, active) != 0
+
+    def _find_opacities(self, faces):
+        """The mean opacity of faces whose null lobe is textured, and 0 for all others, which need none."""
+        self._opacity, n = None, len(faces)
+        if n == 0:
+            return
+        varies = np.zeros(len(self._faces), dtype=bool)
+        varies[faces] = True
+
+        def opacity(face, u, v, back):
+            si = self._faces.surface(face, u, v)
+            return 1 - mi.Color3f(si.bsdf().eval_null_transmission(si))
+
+        zero, one, no = dr.zeros(mi.Float, n), dr.full(mi.Float, 1, n), dr.full(mi.Bool, False, n)
+        mean = Averages(self._faces, varies).mean(opacity, owned(mi.UInt32, faces), no, zero, zero, one)
+        self._opacity = dr.zeros(mi.Float, len(self._faces))
+        dr.scatter(self._opacity, dr.mean(mean), owned(mi.UInt32, faces))
+        dr.eval(self._opacity)
+
+    def relative_opacity(self, si: "mi.SurfaceInteraction3f", face: "mi.UInt32", active: "mi.Bool") -> "mi.Float":
+        """Opacity at points over its mean on the face (Float [n]): what ρ and τ of masks vary with. 1 where it is the
+        same everywhere."""
+        if self._opacity is None:
+            return mi.Float(1)
+        mean = dr.gather(mi.Float, self._opacity, face, active)
+        here = 1 - dr.mean(mi.Color3f(si.bsdf().eval_null_transmission(si, active)))
+        return dr.select(mean > 0, dr.maximum(here, 0) / dr.maximum(mean, 1e-6), 1)
 
     def _find_albedos(self, textured):
         """ρ and τ of shapes whose other lobes are traced: once per shape, or per face where they vary."""

@@ -63,7 +63,7 @@ class _Vertex:
     leaf: "mi.UInt32"  # NONE off patches
     throughput: "mi.Color3f"
     reads: "mi.Bool"  # the path may read the cache from here on
-    cached: "mi.Bool"  # ... and has done so here
+    cached: "mi.Bool"  # ... and the cache stands for the diffuse lobe here
     scattered: "mi.Bool"  # a lobe that is no delta lobe came before
 
 
@@ -136,10 +136,9 @@ class Paths:
         """Where paths end that go on from a first vertex."""
         n = dr.width(vertex.leaf)
         yes, no, black = dr.full(mi.Bool, True, n), dr.full(mi.Bool, False, n), dr.zeros(mi.Color3f, n)
-        leaf, hit = dr.select(vertex.cached, vertex.leaf, NONE), vertex.hit
-        end = PathEnd(black, black + 1, leaf, hit.patch, hit.u, hit.v, yes, no)
-        whole = dr.select(vertex.cached, mi.Float(1), 0)
-        state = yes, vertex, whole, dr.zeros(mi.UInt32, n), random, end
+        none, hit = dr.full(mi.UInt32, NONE, n), vertex.hit
+        end = PathEnd(black, black + 1, none, hit.patch, hit.u, hit.v, yes, no)
+        state = yes, vertex, dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n), random, end
         # Most paths are done after one vertex: the others go on side by side.
         alive, *state = self._step(*state, first)
         dr.eval(alive, state)
@@ -158,13 +157,16 @@ class Paths:
         lot, s, t = (chance.next() for _ in range(3))
         s1, s2 = chance.next(), mi.Point2f(chance.next(), chance.next())
 
-        # What the cache has of the BSDF is taken from it.
-        hit, leaf = vertex.hit, vertex.leaf
-        rho = self._reflectance(leaf, hit.patch, hit.u, hit.v, alive & vertex.cached)
-        behind, tau = model.patches.behind(hit.patch, alive & vertex.cached), mi.Color3f(0)
+        # Read the cache, if there is one here; what it has of the BSDF is taken from that.
+        hit, leaf, cached = vertex.hit, vertex.leaf, alive & vertex.cached
+        face = dr.gather(mi.UInt32, model.patches.face, hit.patch, cached)
+        opacity = model.materials.relative_opacity(si, face, cached)
+        end, whole = _kept(end, whole, cached, vertex.throughput * opacity, leaf, hit, random)
+        rho = self._reflectance(leaf, hit.patch, hit.u, hit.v, cached) * opacity
+        behind, tau = model.patches.behind(hit.patch, cached), mi.Color3f(0)
         if behind is not None:
-            _, tau, _ = behind
-        lobe = _Residual(bsdf, si, dr.select(vertex.cached, rho, 0), tau)
+            tau = behind[1] * opacity
+        lobe = _Residual(bsdf, si, dr.select(cached, rho, 0), tau)
 
         # Next-event estimation, and what no path can find.
         light = self._from_area(lobe, si, leaf, lot, s, t, random, alive) + self._from_others(lobe, si, s, t, alive)
@@ -196,12 +198,12 @@ class Paths:
         emitted += model.lights.sky(ray.d, escaped & ~left_out)
         light += dr.select(goes_on, throughput * emitted * share, 0)
 
-        # Read the cache there, if the path may.
+        # A plainly diffuse surface ends the path if the cache may be read there.
         leaf, reads = self._leaf(hit, goes_on), vertex.reads | (~delta & (pdf < WIDE))
         cached = reads & self._has_cache(hit, leaf)
         passed = end.passed | (alive & ~mi.has_flag(kind, mi.BSDFFlags.Null))
         end = replace(end, light=end.light + light, passed=passed)
-        end, whole = _kept(end, whole, cached, throughput, leaf, hit, random)
+        end, whole = _kept(end, whole, cached & ~hit.traced, throughput, leaf, hit, random)
         vertex = _Vertex(met, ray, hit, leaf, throughput, reads, cached, vertex.scattered | ~delta)
         return goes_on & hit.valid & (hit.traced | ~cached), vertex, whole, depth + 1, random, end
 
