@@ -13,7 +13,7 @@ HOLES = {"type": "checkerboard", "color0": 0.0, "color1": 1.0, "to_uv": T().scal
 
 
 def foliage(**mask):
-    """Three sheets above each other over a floor, under a white sky, which `path` needs to show what null lobes pass."""
+    """Three sheets above each other over a floor, under a white sky: without it `path` drops light behind masks."""
     bsdf = {"type": "mask", "bsdf": diffuse(0.5, two_sided=True)} | mask
     film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
     look = T().look_at([0, -2.5, 1.6], [0, 0, 0.3], [0, 0, 1])
