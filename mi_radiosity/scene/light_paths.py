@@ -64,8 +64,9 @@ def light_paths(rays: Rays, lights: Lights) -> LightPaths:
             if dr.width(paths.key) == 0:
                 break
             paths = _segment(rays, paths, number, lit, hits, number + 1 == segments)
-            if number == 0:
-                paths = paths.only(GO_ON * dr.arange(mi.UInt32, dr.width(paths.key) // GO_ON))
+            some = dr.width(paths.key) // GO_ON
+            if number == 0 and some:
+                paths = paths.only(GO_ON * dr.arange(mi.UInt32, some))
     return LightPaths(np.array(lit) > 0, np.array(hits, dtype=np.int64))
 
 
